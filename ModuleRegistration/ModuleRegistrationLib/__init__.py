@@ -1,0 +1,1 @@
+"""From a head CT to a verified registration: anatomy, registration, verification. Pure Python, no MRML, no Qt."""

@@ -1,0 +1,1 @@
+"""What the CT holds: volume, bone surface, titanium spheres, landmarks."""

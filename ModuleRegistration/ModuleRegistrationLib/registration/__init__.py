@@ -1,0 +1,1 @@
+"""Landmark and surface registration, their error theory and the verdict on them."""

@@ -1,0 +1,1 @@
+"""What a registration is worth, shown with data it has not seen: TRE, plausibility, studies, report."""

@@ -1,0 +1,106 @@
+"""The tracker plugin kind: what a tracker is asked, and the pose that it answers with."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from enum import Enum
+from types import TracebackType
+from typing import Optional
+
+from CranioNavLib.plugins import Plugin, PluginKind
+from CranioNavLib.rigid import Array
+
+
+class PoseStatus(str, Enum):
+    """Why a tool has a pose, or has none. The words are those of PLUS sequence files."""
+
+    OK = "OK"
+    MISSING = "MISSING"
+    OUT_OF_VOLUME = "OUT_OF_VOLUME"  # seen, but where the maker promises no accuracy
+    INVALID = "INVALID"  # seen, but the device or a check says not to use it
+    STALE = "STALE"  # no news for longer than the staleness limit
+
+
+@dataclass(frozen=True, eq=False)
+class ToolPose:
+    """One tool in one frame of the tracker. A tool without a trustworthy pose has None, never an old pose."""
+
+    tool: str  # "Probe", "Stylus", "Reference", "Sphere"
+    tool_to_tracker: Optional[Array]  # (4, 4), mm; None unless the status is OK or OUT_OF_VOLUME
+    status: PoseStatus
+    host_time_s: float  # time.monotonic() clock of this computer at arrival
+    device_time_s: float = float("nan")  # the tracker's own clock, from its frame number
+    frame_number: int = -1
+    error_mm: float = float("nan")  # the tracker's own RMS fit error
+    flags: tuple[str, ...] = ()  # in words: "partly out of volume", "interference", ...
+
+    @property
+    def usable(self) -> bool:
+        """Whether navigation may use this pose."""
+        return self.status is PoseStatus.OK and self.tool_to_tracker is not None
+
+
+@dataclass(frozen=True)
+class ToolInfo:
+    """A tool that a tracker knows."""
+
+    name: str
+    part_number: str = ""
+    serial_number: str = ""
+    detail: str = ""
+
+
+class Tracker(Plugin):
+    """Base of tracker plugins. `with tracker:` opens, starts and always closes.
+
+    All methods are called from one thread. They raise `TrackerError` for what the device does and
+    `InputError` for what the user gave.
+    """
+
+    @abstractmethod
+    def open(self) -> None:
+        """Connect and set the device up."""
+
+    @abstractmethod
+    def start(self) -> None:
+        """Begin tracking."""
+
+    @abstractmethod
+    def read(self, timeout_s: float = 1.0) -> list[ToolPose]:
+        """The next frame: one ToolPose for every tool, missing ones included; empty if none came in time."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """End tracking; may be called twice."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of the device; may be called twice, and after a failure."""
+
+    @property
+    @abstractmethod
+    def tools(self) -> list[ToolInfo]:
+        """The tools known after `open`."""
+
+    def __enter__(self) -> Tracker:
+        try:
+            self.open()
+            self.start()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        try:
+            self.stop()
+        finally:
+            self.close()
+
+
+class TrackerError(RuntimeError):
+    """The tracker failed or was lost; the message says what happened and what to do."""
+
+
+TRACKERS: PluginKind[Tracker] = PluginKind("tracker", Tracker, folder="ModuleTrackingLib.plugins")  # type: ignore[type-abstract]

@@ -1,0 +1,1 @@
+"""One file an A-mode device."""

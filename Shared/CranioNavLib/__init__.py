@@ -1,0 +1,1 @@
+"""Ground floor of CranioNav: what tracking, ultrasound and registration all stand on."""
