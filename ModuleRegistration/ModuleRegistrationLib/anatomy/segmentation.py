@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from CranioNavLib.plugins import Plugin, PluginKind
 from CranioNavLib.surface import Surface
-from ModuleRegistrationLib.anatomy.volume import Volume
+from CranioNavLib.volume import Volume
 
 
 @dataclass(frozen=True, eq=False)

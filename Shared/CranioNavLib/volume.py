@@ -1,4 +1,4 @@
-"""Volume: a CT in Hounsfield units with its place in RAS, read from DICOM, NRRD, NIfTI or MHA."""
+"""Volume: a CT in Hounsfield units with its place in RAS."""
 
 from __future__ import annotations
 
