@@ -9,7 +9,6 @@ from typing import Optional
 
 import numpy as np
 import numpy.typing as npt
-
 from CranioNavLib.plugins import Plugin, PluginKind
 from CranioNavLib.sequence_metafile import Acquisition
 

@@ -36,7 +36,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     temporary.chmod(0o666 & ~umask)  # mkstemp makes files private; the result is an ordinary file
     try:
         yield temporary
-        os.replace(temporary, path)
+        temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -1,8 +1,8 @@
 """Typed parameters: frozen dataclasses whose fields carry unit, limits and help in their type.
 
-    @dataclass(frozen=True)
-    class Settings(Parameters):
-        rate_hz: Annotated[float, Limits(1, 1000), "poses a second"] = 60.0
+@dataclass(frozen=True)
+class Settings(Parameters):
+    rate_hz: Annotated[float, Limits(1, 1000), "poses a second"] = 60.0
 """
 
 from __future__ import annotations
@@ -45,7 +45,19 @@ class ParameterInfo:
         return ""
 
 
-UNITS = {"_m_s": "m/s", "_mm": "mm", "_deg": "°", "_ms": "ms", "_s": "s", "_mhz": "MHz", "_hz": "Hz", "_db": "dB", "_hu": "HU", "_us": "µs", "_ns": "ns"}
+UNITS = {
+    "_m_s": "m/s",
+    "_mm": "mm",
+    "_deg": "°",
+    "_ms": "ms",
+    "_s": "s",
+    "_mhz": "MHz",
+    "_hz": "Hz",
+    "_db": "dB",
+    "_hu": "HU",
+    "_us": "µs",
+    "_ns": "ns",
+}
 
 
 @dataclass(frozen=True)
@@ -54,7 +66,7 @@ class Parameters:
 
     def __post_init__(self) -> None:
         for info in self.describe():
-            value = getattr(self, info.name)
+            value: Any = getattr(self, info.name)
             if value is None and info.optional:
                 continue
             where = f"parameter {info.name}"
@@ -63,7 +75,7 @@ class Parameters:
                 object.__setattr__(self, info.name, value)
             if not isinstance(value, info.kind) or (info.kind is not bool and isinstance(value, bool)):
                 raise InputError(f"{where}: expected {info.kind.__name__}, got {value!r}")
-            if info.limits and not info.limits.low <= value <= info.limits.high:
+            if info.limits and not info.limits.low <= float(value) <= info.limits.high:
                 raise InputError(f"{where} is {value}; expected {info.limits.low} to {info.limits.high} {info.unit}".rstrip())
 
     @classmethod
@@ -92,7 +104,9 @@ class Parameters:
     def to_strings(self) -> dict[str, str]:
         """The inverse of from_strings; parameters that are None are left out."""
         values = {info.name: getattr(self, info.name) for info in self.describe()}
-        return {name: value.value if isinstance(value, Enum) else str(value) for name, value in values.items() if value is not None}
+        return {
+            name: value.value if isinstance(value, Enum) else str(value) for name, value in values.items() if value is not None
+        }
 
 
 def _describe_field(field: dataclasses.Field[Any], hint: Any) -> ParameterInfo:
@@ -119,8 +133,14 @@ def _describe_field(field: dataclasses.Field[Any], hint: Any) -> ParameterInfo:
 def _parse(info: ParameterInfo, text: str) -> Any:
     try:
         if info.kind is bool:
-            return {"true": True, "yes": True, "1": True, "on": True, "false": False, "no": False, "0": False, "off": False}[text.strip().lower()]
+            return {"true": True, "yes": True, "1": True, "on": True, "false": False, "no": False, "0": False, "off": False}[
+                text.strip().lower()
+            ]
         return info.kind(text)
     except (ValueError, KeyError):
-        choices = f"one of {', '.join(str(c.value) for c in info.kind)}" if issubclass(info.kind, Enum) else f"a value of type {info.kind.__name__}"
+        choices = (
+            f"one of {', '.join(str(c.value) for c in info.kind)}"
+            if issubclass(info.kind, Enum)
+            else f"a value of type {info.kind.__name__}"
+        )
         raise InputError(f"parameter {info.name}: expected {choices}, got {text!r}") from None

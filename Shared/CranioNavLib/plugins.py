@@ -75,7 +75,12 @@ class PluginKind(Generic[T]):
         checked = self._checked(plugin)
         taken = self._registered.get(checked.name)
         if taken is not None and taken.__qualname__ != checked.__qualname__:
-            raise InputError(f"{self.kind} plugin name {checked.name!r} is already used by {taken.__module__}.{taken.__qualname__}; choose another name")
+            raise InputError(
+                f"{self.kind} plugin name {checked.name!r} is already used by "
+                f"{taken.__module__}.{taken.__qualname__}; choose another name"
+            )
+                f"{self.kind} plugin name {checked.name!r} is already used by {taken.__module__}.{taken.__qualname__}; choose another name"
+            )
         self._registered[checked.name] = checked
         return plugin
 
@@ -100,7 +105,9 @@ class PluginKind(Generic[T]):
             try:
                 return self._checked(entry.load(), expected_name=name)
             except (ImportError, AttributeError) as error:
-                raise InputError(f"{self.kind} plugin {name!r} ({entry.value}) cannot be loaded: {error}; install what it needs") from error
+                raise InputError(
+                    f"{self.kind} plugin {name!r} ({entry.value}) cannot be loaded: {error}; install what it needs"
+                ) from error
         raise InputError(f"unknown {self.kind} {name!r}; installed: {', '.join(self.names()) or 'none'}")
 
     def create(self, name: str, **settings: str) -> T:
@@ -147,16 +154,24 @@ class PluginKind(Generic[T]):
     def _checked(self, plugin: Any, expected_name: str = "") -> type[T]:
         where = f"{getattr(plugin, '__module__', '?')}.{getattr(plugin, '__qualname__', plugin)}"
         if not (inspect.isclass(plugin) and issubclass(plugin, self.base)):
-            raise InputError(f"{where} is not a {self.kind} plugin; expected a subclass of {self.base.__module__}.{self.base.__name__}")
+            raise InputError(
+                f"{where} is not a {self.kind} plugin; expected a subclass of {self.base.__module__}.{self.base.__name__}"
+            )
         if not plugin.name:
-            raise InputError(f"{self.kind} plugin {where} has no name; give it name = \"...\"")
+            raise InputError(f'{self.kind} plugin {where} has no name; give it name = "..."')
         if expected_name and plugin.name != expected_name:
-            raise InputError(f"{self.kind} plugin {where} is named {plugin.name!r} but its entry point {expected_name!r}; make them equal")
+            raise InputError(
+                f"{self.kind} plugin {where} is named {plugin.name!r} but its entry point {expected_name!r}; make them equal"
+            )
         missing = sorted(getattr(plugin, "__abstractmethods__", ()))
         if missing:
-            raise InputError(f"{self.kind} plugin {plugin.name!r} ({where}) lacks {', '.join(missing)}; add what {self.base.__name__} asks for")
+            raise InputError(
+                f"{self.kind} plugin {plugin.name!r} ({where}) lacks {', '.join(missing)}; add what {self.base.__name__} asks for"
+            )
         if not (inspect.isclass(plugin.Settings) and issubclass(plugin.Settings, Parameters)):
-            raise InputError(f"{self.kind} plugin {plugin.name!r} ({where}): Settings must be a subclass of CranioNavLib.parameters.Parameters")
+            raise InputError(
+                f"{self.kind} plugin {plugin.name!r} ({where}): Settings must be a subclass of CranioNavLib.parameters.Parameters"
+            )
         return plugin
 
 

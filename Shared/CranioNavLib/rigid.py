@@ -34,7 +34,9 @@ def check_points(points: npt.ArrayLike, name: str = "points", at_least: int = 0)
         raise InputError(f"expected at least {at_least} {name}, got {len(array)}; add the missing ones")
     bad = ~np.isfinite(array).all(axis=1)
     if bad.any():
-        raise InputError(f"{name}: number {int(np.argmax(bad)) + 1} has a coordinate that is not a finite number; remove or measure it again")
+        raise InputError(
+            f"{name}: number {int(np.argmax(bad)) + 1} has a coordinate that is not a finite number; remove or measure it again"
+        )
     if array.size and np.abs(array).max() > LARGEST_COORDINATE_MM:
         worst = int(np.argmax(np.abs(array).max(axis=1))) + 1
         raise InputError(f"{name}: number {worst} lies {np.abs(array).max():.3g} mm away; coordinates are expected in mm")

@@ -7,6 +7,7 @@ mesh is centred for it: at 150 mm from the centre the rounding is 1e-5 mm.
 from __future__ import annotations
 
 import hashlib
+import importlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -95,7 +96,7 @@ class Surface:
 
     @cached_property
     def _index(self) -> Any:
-        import open3d
+        open3d: Any = importlib.import_module("open3d")
 
         scene = open3d.t.geometry.RaycastingScene()
         scene.add_triangles(
@@ -190,7 +191,9 @@ class Surface:
         name = READERS.get(path.suffix.lower())
         if name is None:
             raise InputError(f"cannot read {path}: unknown surface format; use {', '.join(READERS)}")
-        reader = next(getattr(module, name) for module in (vtkIOXML, vtkIOPLY, vtkIOGeometry, vtkIOLegacy) if hasattr(module, name))()
+        reader = next(
+            getattr(module, name) for module in (vtkIOXML, vtkIOPLY, vtkIOGeometry, vtkIOLegacy) if hasattr(module, name)
+        )()
         reader.SetFileName(str(path))
         reader.Update()
         if reader.GetOutput() is None or reader.GetOutput().GetNumberOfPoints() == 0:

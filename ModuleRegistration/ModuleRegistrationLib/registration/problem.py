@@ -8,7 +8,6 @@ from typing import Optional
 
 import numpy as np
 import numpy.typing as npt
-
 from CranioNavLib.bone_points import BonePoints
 from CranioNavLib.plugins import Plugin, PluginKind
 from CranioNavLib.rigid import Array
@@ -50,7 +49,9 @@ class RegistrationResult:
     iterations: int
     stop_reason: str  # in words: "change below 1e-6 mm", "iteration limit 100"
     points_ras_mm: Array  # (N, 3) the points as registered (speed of sound and offset applied)
-    covariance: Optional[Array] = None  # (6, 6) of a small motion (rotation rad about pivot_ras_mm, then translation mm), in RAS axes
+    covariance: Optional[Array] = (
+        None  # (6, 6) of a small motion (rotation rad about pivot_ras_mm, then translation mm), in RAS axes
+    )
     pivot_ras_mm: Array = field(default_factory=lambda: np.zeros(3))  # (3,)
     speed_of_sound_m_s: float = float("nan")  # estimated or assumed; NaN: no sound was used
     speed_of_sound_sd_m_s: float = float("nan")
