@@ -79,8 +79,6 @@ class PluginKind(Generic[T]):
                 f"{self.kind} plugin name {checked.name!r} is already used by "
                 f"{taken.__module__}.{taken.__qualname__}; choose another name"
             )
-                f"{self.kind} plugin name {checked.name!r} is already used by {taken.__module__}.{taken.__qualname__}; choose another name"
-            )
         self._registered[checked.name] = checked
         return plugin
 
