@@ -75,7 +75,7 @@ class Parameters:
                 object.__setattr__(self, info.name, value)
             if not isinstance(value, info.kind) or (info.kind is not bool and isinstance(value, bool)):
                 raise InputError(f"{where}: expected {info.kind.__name__}, got {value!r}")
-            if info.limits and not info.limits.low <= float(value) <= info.limits.high:
+            if info.limits and not info.limits.low <= float(getattr(self, info.name)) <= info.limits.high:
                 raise InputError(f"{where} is {value}; expected {info.limits.low} to {info.limits.high} {info.unit}".rstrip())
 
     @classmethod

@@ -17,6 +17,7 @@ import importlib.util
 import inspect
 import pkgutil
 import sys
+from abc import ABC
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -27,7 +28,7 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.parameters import Parameters
 
 
-class Plugin:
+class Plugin(ABC):
     """What every plugin has, whatever its kind."""
 
     name: ClassVar[str] = ""  # as the user types it: lower case, digits, hyphens
@@ -133,8 +134,9 @@ class PluginKind(Generic[T]):
             return {}
         folder = importlib.import_module(self.folder)
         kinds: dict[str, str] = getattr(folder, "KIND_OF", {})
+        default: str = getattr(folder, "DEFAULT_KIND", self.kind)
         names = [info.name for info in pkgutil.iter_modules(folder.__path__) if not info.name.startswith("_")]
-        return {name.replace("_", "-"): name for name in names if kinds.get(name, self.kind) == self.kind}
+        return {name.replace("_", "-"): name for name in names if kinds.get(name, default) == self.kind}
 
     def _entry_points(self) -> dict[str, Any]:
         if sys.version_info >= (3, 10):

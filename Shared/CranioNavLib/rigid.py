@@ -85,7 +85,7 @@ def rigid_from_vector(rotation_vector: npt.ArrayLike, translation: npt.ArrayLike
     """Transform(s) that rotate about `pivot` (mm) by a rotation vector (rad), then translate (mm). Batched."""
     turn = Rotation.from_rotvec(np.asarray(rotation_vector, dtype=float)).as_matrix()
     pivot = np.asarray(pivot, dtype=float)
-    return rigid(turn, np.asarray(translation, dtype=float) + pivot - turn @ pivot)
+    return rigid(turn, np.asarray(translation, dtype=float) + pivot - np.einsum("...ij,...j->...i", turn, pivot))
 
 
 def invert_rigid(matrix: npt.ArrayLike) -> Array:

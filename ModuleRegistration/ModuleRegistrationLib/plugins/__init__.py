@@ -1,4 +1,4 @@
 """One file a method: surface registration, segmentation."""
 
-# Which kind a file's plugin is, where it is not surface registration
+DEFAULT_KIND = "registration"
 KIND_OF = {"threshold": "segmentation", "gradient": "segmentation"}
