@@ -1,0 +1,326 @@
+"""The palpation protocol: 18 points placed on any head, where a probe can stand square on bone.
+
+The chapter palpates 3 points left lateral, 3 right lateral, 4 on the frontal convexity, 4 on the forehead
+and 4 around the orbits. Here each has a window, a cone of directions seen from the head's middle; inside
+the windows the points are chosen so that together they hold all six degrees of freedom best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Optional
+
+import numpy as np
+import numpy.typing as npt
+from CranioNavLib.errors import InputError
+from CranioNavLib.rigid import Array, check_points, invert_rigid, rigid, transform_directions, transform_points
+from CranioNavLib.surface import Surface
+
+LANDMARK_LABELS = ("Nasion", "Left frontozygomatic", "Right frontozygomatic", "Anterior nasal spine")
+REGIONS = ("Left lateral", "Right lateral", "Frontal convexity", "Forehead", "Periorbital")
+
+# Azimuth from the face to the side and elevation above the nasion's plane, degrees, of the nine mirrored pairs,
+# seen from the point half a head's length behind the nasion.
+PAIRS = {
+    "Lateral 1": (62.0, 30.0),  # above the temporal line, in front of the ear
+    "Lateral 2": (92.0, 16.0),  # temporal squama, above the ear
+    "Lateral 3": (112.0, 42.0),  # parietal bone
+    "Frontal convexity 1": (52.0, 54.0),
+    "Frontal convexity 2": (22.0, 58.0),
+    "Forehead 1": (34.0, 30.0),
+    "Forehead 2": (11.0, 36.0),
+    "Periorbital 1": (20.0, 11.0),  # above the supraorbital rim
+    "Periorbital 2": (36.0, -21.0),  # body of the zygoma, below and beside the orbit
+}
+WINDOW_RADII_DEG = (9.0, 15.0, 22.0)  # tried in turn: a window that holds a defect or a clamp is widened
+GRID_STEP_DEG = 1.8
+
+PROBE_FACE_RADIUS_MM = 2.5  # 5 mm element
+PROBE_BODY_RADIUS_MM = 7.0  # housing that must not meet bone beside the point
+STAND_OFF_MM = 40.0  # a probe comes in from here without touching bone
+LARGEST_STEP_MM = 2.5  # of the bone under the probe's body
+LARGEST_ROUGHNESS_MM = 0.45  # RMS from the plane through the bone under the body
+SMALLEST_SPACING_MM = 20.0
+ADULT_LENGTH_MM = 178.0  # nasion to opisthocranion, where the CT does not reach the back of the head
+LATERAL_SD_MM = 0.6  # of a bone point along the surface normal: one value for all, only ratios matter here
+PRIOR_SD_MM = 3.0  # landmark registration, per axis; keeps the information regular with few points
+
+
+@dataclass(frozen=True, eq=False)
+class ProtocolPoints:
+    """Where to palpate. RAS, mm; normals point out of the bone."""
+
+    labels: tuple[str, ...]
+    positions_ras_mm: Array  # (N, 3) on the surface
+    normals: Array  # (N, 3) unit, of the plane through the bone under the probe
+    regions: tuple[str, ...]
+    head_to_ras: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) origin at the nasion, x right, y anterior, z up
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+
+@dataclass(frozen=True, eq=False)
+class _Spot:
+    """A place where a probe can stand."""
+
+    position: Array  # (3,)
+    normal: Array  # (3,)
+    offset: tuple[int, int]  # grid place within the window, the same number on both sides of the head
+    penalty: float
+
+
+def plan_protocol(
+    surface: Surface, landmarks_ras_mm: Optional[npt.ArrayLike] = None, labels: Optional[Sequence[str]] = None
+) -> ProtocolPoints:
+    """The 18 points of the protocol on a skull.
+
+    Parameters
+    ----------
+    surface : Surface
+        Outer table of the skull, RAS, mm, outward normals; it may be open (cropped CT, craniotomy).
+    landmarks_ras_mm : array-like, shape (N, 3), optional
+        Anatomical landmarks. With the four of `LANDMARK_LABELS` among them (or four without labels, in that
+        order) they give the head's axes; else the RAS axes and the surface's shape do.
+    labels : sequence of str, optional
+        Names of the landmarks.
+
+    Returns
+    -------
+    ProtocolPoints
+        Three left lateral, three right lateral, four each on frontal convexity, forehead and around the orbits.
+
+    Raises
+    ------
+    InputError
+        Landmarks and labels differ in number, or the surface lacks a region of the protocol.
+    """
+    head_to_ras = _head_frame(surface, landmarks_ras_mm, labels)
+    center, reach = _middle(surface, head_to_ras)
+    windows: dict[tuple[str, int], list[_Spot]] = {}
+    for name in PAIRS:
+        for side in (-1, 1):
+            windows[name, side] = _spots_for(surface, head_to_ras, center, reach, name, side)
+    chosen = _choose(windows, center)
+    names, spots, regions = [], [], []
+    for region in REGIONS:
+        for label, key in _slots(region):
+            names.append(label)
+            spots.append(chosen[key])
+            regions.append(region)
+    return ProtocolPoints(
+        labels=tuple(names),
+        positions_ras_mm=np.array([spot.position for spot in spots]),
+        normals=np.array([spot.normal for spot in spots]),
+        regions=tuple(regions),
+        head_to_ras=head_to_ras,
+    )
+
+
+def _slots(region: str) -> list[tuple[str, tuple[str, int]]]:
+    """Labels of a region with the pair and side each stands for; across the forehead they run from left to right."""
+    if region.endswith("lateral"):
+        side = -1 if region.startswith("Left") else 1
+        return [(f"{region} {k}", (f"Lateral {k}", side)) for k in (1, 2, 3)]
+    order = [(1, -1), (2, -1), (2, 1), (1, 1)]
+    return [(f"{region} {k + 1}", (f"{region} {pair}", side)) for k, (pair, side) in enumerate(order)]
+
+
+def _head_frame(surface: Surface, landmarks: Optional[npt.ArrayLike], labels: Optional[Sequence[str]]) -> Array:
+    """HeadToRas: origin at the nasion, x to the right, y anterior, z superior."""
+    if landmarks is not None:
+        points = check_points(landmarks, "landmarks")
+        if labels is None:
+            labels = LANDMARK_LABELS if len(points) == len(LANDMARK_LABELS) else [""] * len(points)
+        if len(labels) != len(points):
+            raise InputError(f"got {len(points)} landmarks and {len(labels)} labels; give one label a landmark")
+        known = {label.strip().lower(): point for label, point in zip(labels, points)}
+        wanted = [known.get(label.lower()) for label in LANDMARK_LABELS]
+        if all(point is not None for point in wanted):
+            return _frame_from_landmarks(np.array(wanted, dtype=float))
+    return _frame_from_shape(surface)
+
+
+def _frame_from_landmarks(points: Array) -> Array:
+    nasion, left, right, spine = points
+    x = right - left
+    z = nasion - spine
+    if np.linalg.norm(x) < 30.0 or np.linalg.norm(z) < 20.0:
+        raise InputError(
+            "the landmarks do not span a face (frontozygomatic points closer than 30 mm, or nasion closer than 20 mm to the "
+            "nasal spine); check their labels and their unit (mm)"
+        )
+    x /= np.linalg.norm(x)
+    z -= (z @ x) * x
+    z /= np.linalg.norm(z)
+    return rigid(np.column_stack([x, np.cross(z, x), z]), nasion)
+
+
+def _frame_from_shape(surface: Surface) -> Array:
+    """Axes of RAS, origin at the nasion as the midline profile shows it: the dip below the brow."""
+    low, high = surface.vertices_mm.min(axis=0), surface.vertices_mm.max(axis=0)
+    middle_x = (low[0] + high[0]) / 2
+    heights = np.arange(high[2] - 60.0, max(low[2], high[2] - 135.0), -1.0)
+    origins = np.column_stack([np.full(len(heights), middle_x), np.full(len(heights), high[1] + 50.0), heights])
+    profile = high[1] + 50.0 - surface.cast(origins, np.array([0.0, -1.0, 0.0])).distances_mm
+    nasion = np.array([middle_x, high[1] - 8.0, high[2] - 100.0])  # adult mean, if the profile shows no dip
+    for k in range(8, len(heights) - 8):
+        above, below = profile[max(0, k - 15) : k], profile[k + 1 : k + 16]
+        in_front = profile[k] > high[1] - 45.0
+        if in_front and profile[k] <= profile[k - 8 : k + 9].min() and min(above.max(), below.max()) > profile[k] + 1.0:
+            nasion = np.array([middle_x, profile[k], heights[k]])
+            break
+    return rigid(np.eye(3), nasion)
+
+
+def _middle(surface: Surface, head_to_ras: Array) -> tuple[Array, float]:
+    """The point that the windows are seen from (RAS), and a distance that lies outside the head in every direction."""
+    vertices = transform_points(invert_rigid(head_to_ras), surface.vertices_mm)
+    back = -float(vertices[:, 1].min())
+    length = back if 0.85 * ADULT_LENGTH_MM < back < 1.2 * ADULT_LENGTH_MM else ADULT_LENGTH_MM
+    center = transform_points(head_to_ras, [[0.0, -length / 2, 0.0]])[0]
+    return center, float(np.linalg.norm(surface.vertices_mm - center, axis=1).max()) + STAND_OFF_MM
+
+
+def _directions(name: str, side: int, radius_deg: float) -> tuple[Array, list[tuple[int, int]]]:
+    """Unit directions (M, 3) of a window's grid in the head's frame, and their places in the grid."""
+    azimuth, elevation = np.radians(PAIRS[name])
+    outward = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
+    across = np.array([np.cos(azimuth), -np.sin(azimuth), 0.0])
+    up = np.cross(across, outward)
+    count = int(radius_deg / GRID_STEP_DEG)
+    places = [(i, j) for i in range(-count, count + 1) for j in range(-count, count + 1) if i * i + j * j <= count * count]
+    steps = np.tan(np.radians(GRID_STEP_DEG)) * np.array(places, dtype=float)
+    rays = outward + steps[:, :1] * across + steps[:, 1:] * up
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays[:, 0] *= side
+    return rays, places
+
+
+def _spots_for(surface: Surface, head_to_ras: Array, center: Array, reach: float, name: str, side: int) -> list[_Spot]:
+    """Places of a window where a probe can stand; the window grows until it holds some."""
+    for radius_deg in WINDOW_RADII_DEG:
+        rays, places = _directions(name, side, radius_deg)
+        outward = transform_directions(head_to_ras, rays)
+        hits = surface.cast(center + reach * outward, -outward)
+        seen = np.isfinite(hits.distances_mm) & (hits.distances_mm < reach - 30.0)  # nearer the middle: through a hole
+        if not seen.any():
+            continue
+        positions = (center + (reach - hits.distances_mm[:, None]) * outward)[seen]
+        positions, normals, roughness, good = probe_footprint(surface, positions, outward[seen])
+        kept = [place for place, flag in zip(places, seen) if flag]
+        spots = [
+            _Spot(positions[k], normals[k], kept[k], 0.02 * float(np.hypot(*kept[k])) + 0.5 * float(roughness[k]))
+            for k in np.flatnonzero(good)
+        ]
+        if spots:
+            return spots
+    where = f"{'left' if side < 0 else 'right'} {name.lower()}"
+    raise InputError(
+        f"no place for the probe at {where}: the bone surface is missing or too rough there; "
+        "extend or mend the surface, or check the landmarks that orient the head"
+    )
+
+
+def probe_footprint(surface: Surface, positions_mm: Array, outward: Array) -> tuple[Array, Array, Array, npt.NDArray[np.bool_]]:
+    """How a probe would stand on a surface at points (M, 3), coming in roughly along -`outward` (M, 3).
+
+    Returns
+    -------
+    positions (M, 3) on the surface, normals (M, 3) of the plane through the bone under the probe's body,
+    roughness (M,) RMS distance from that plane in mm, and (M,) whether a probe can stand there: bone under
+    all of its body, no step, nothing in the way of its approach.
+    """
+    axis = outward
+    for _ in range(2):  # the first plane straightens the approach, the second is measured along it
+        offsets, heights = _heights_under_probe(surface, positions_mm, axis)
+        whole = np.asarray(np.abs(heights).max(axis=1) < 2 * PROBE_BODY_RADIUS_MM)
+        slopes, roughness = _fit_planes(offsets, np.where(whole[:, None], heights, 0.0))
+        across, up = _tangents(axis)
+        normals = axis - slopes[:, :1] * across - slopes[:, 1:] * up
+        axis = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    step = np.abs(heights).max(axis=1)
+    good = whole & (step < LARGEST_STEP_MM) & (roughness < LARGEST_ROUGHNESS_MM)
+    return positions_mm, axis, roughness, good
+
+
+def _tangents(axis: Array) -> tuple[Array, Array]:
+    """Two unit vectors (M, 3) each, square to `axis` (M, 3) and to each other."""
+    helper = np.where(np.abs(axis[:, 2:]) < 0.9, np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 0.0]]))
+    across = np.cross(helper, axis)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    return across, np.cross(axis, across)
+
+
+def _heights_under_probe(surface: Surface, positions: Array, axis: Array) -> tuple[Array, Array]:
+    """Heights (M, R) of the bone over the plane through each point square to `axis`; offsets (R, 2) in that plane."""
+    angles = np.arange(8) * np.pi / 4
+    circle = np.column_stack([np.cos(angles), np.sin(angles)])
+    offsets = np.concatenate([[[0.0, 0.0]], PROBE_FACE_RADIUS_MM * circle, PROBE_BODY_RADIUS_MM * circle])
+    across, up = _tangents(axis)
+    feet = positions[:, None] + offsets[None, :, :1] * across[:, None] + offsets[None, :, 1:] * up[:, None]
+    origins = feet + STAND_OFF_MM * axis[:, None]
+    rays = np.broadcast_to(-axis[:, None], origins.shape)
+    distances = surface.cast(origins.reshape(-1, 3), rays.reshape(-1, 3)).distances_mm.reshape(origins.shape[:2])
+    return offsets, STAND_OFF_MM - distances
+
+
+def _fit_planes(offsets: Array, heights: Array) -> tuple[Array, Array]:
+    """Slopes (M, 2) and RMS residual (M,) of planes fitted to heights (M, R) at offsets (R, 2)."""
+    design = np.column_stack([offsets, np.ones(len(offsets))])
+    solution = heights @ np.linalg.pinv(design).T
+    residuals = heights - solution @ design.T
+    roughness: Array = np.sqrt(np.mean(residuals**2, axis=1))
+    return solution[:, :2], roughness
+
+
+def _information(spot: _Spot, center: Array) -> Array:
+    """What a point tells of a small motion (rotation rad about `center`, translation mm): (6, 6)."""
+    row = np.concatenate([np.cross(spot.position - center, spot.normal), spot.normal])
+    information: Array = np.outer(row, row) / LATERAL_SD_MM**2
+    return information
+
+
+def _choose(windows: dict[tuple[str, int], list[_Spot]], center: Array) -> dict[tuple[str, int], _Spot]:
+    """One spot a window, so that the summed squared error over the head is least; both sides alike where they can be."""
+    chosen = {key: min(spots, key=lambda spot: spot.penalty) for key, spots in windows.items()}
+    arms = 75.0 * np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))])  # targets all round the middle
+    prior = np.diag([(75.0 / PRIOR_SD_MM) ** 2] * 3 + [1.0 / PRIOR_SD_MM**2] * 3)
+    for _ in range(3):
+        before = dict(chosen)
+        for name in PAIRS:
+            others = {key: spot for key, spot in chosen.items() if key[0] != name}
+            base = prior + sum((_information(spot, center) for spot in others.values()), np.zeros((6, 6)))
+            chosen[name, -1], chosen[name, 1] = min(
+                _pairings(windows[name, -1], windows[name, 1]),
+                key=lambda pair: _cost(pair, others, base, arms, center),
+            )
+        if all(before[key] is chosen[key] for key in chosen):
+            break
+    return chosen
+
+
+def _pairings(left: list[_Spot], right: list[_Spot]) -> list[tuple[_Spot, _Spot]]:
+    """Pairs of spots that mirror each other; where the other side has no bone, its best spots near by stand in."""
+    by_place = {spot.offset: spot for spot in right}
+    mirrored = [(spot, by_place[spot.offset]) for spot in left if spot.offset in by_place]
+    if len(mirrored) >= 5:
+        return mirrored
+    best_left, best_right = (sorted(side, key=lambda spot: spot.penalty)[:12] for side in (left, right))
+    return mirrored + [(a, b) for a in best_left for b in best_right]
+
+
+def _cost(pair: tuple[_Spot, _Spot], others: dict[tuple[str, int], _Spot], base: Array, arms: Array, center: Array) -> float:
+    """Predicted mean squared error (mm^2) over the arms' ends, plus penalties for crowding and rough places."""
+    covariance = np.linalg.inv(base + _information(pair[0], center) + _information(pair[1], center))
+    squared = 0.0
+    for arm in arms:
+        cross = np.array([[0, arm[2], -arm[1]], [-arm[2], 0, arm[0]], [arm[1], -arm[0], 0]])
+        motion = np.concatenate([cross, np.eye(3)], axis=1)
+        squared += float(np.trace(motion @ covariance @ motion.T)) / len(arms)
+    places = np.array([spot.position for spot in (*others.values(), *pair)])
+    gaps = np.linalg.norm(places[None, -2:] - places[:-1, None], axis=2)
+    gaps[-1, 0] = np.inf  # to itself
+    crowding = float(np.clip(SMALLEST_SPACING_MM - gaps, 0.0, None).sum() / SMALLEST_SPACING_MM)
+    return squared * (1.0 + 2.0 * crowding) + 0.05 * (pair[0].penalty + pair[1].penalty)
