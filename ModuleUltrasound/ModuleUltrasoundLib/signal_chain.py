@@ -1,0 +1,123 @@
+"""From raw RF lines to complex envelopes: drift removal, zero-phase band-pass, demodulation. All lines at once.
+
+The band-pass and the demodulation are one multiplication in the frequency domain; only the band is transformed
+back, so the complex envelope comes out at the few samples a cycle that it needs, whatever the converter's rate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from CranioNavLib.errors import InputError
+from CranioNavLib.sequence_metafile import Acquisition
+from scipy import fft
+
+Floats = npt.NDArray[np.float32]
+
+# The pulse's centre lies a little below the transducer's nominal frequency once tissue has taken its upper
+# part; a damped transducer's -6 dB band is 50 to 100 % of it.
+BAND_CENTRE = 0.92  # of the transducer's frequency
+BAND_WIDTH = 0.85  # full width at half amplitude, of the transducer's frequency
+BAND_EDGES = (0.25, 1.9)  # of the transducer's frequency: nothing outside gets through (drift, spikes' upper part)
+OVERSAMPLING = 4.0  # complex samples a cycle of the transducer's frequency
+
+
+@dataclass(frozen=True, eq=False)
+class Envelopes:
+    """Complex envelopes of n lines: `|values|` is the envelope, its phase that of the RF at `carrier_hz`."""
+
+    values: npt.NDArray[np.complex64]  # (n, M)
+    rate_hz: float  # samples of `values` a second; sample 0 is the line's time zero
+    carrier_hz: float
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """The band-pass of a recording: which bins of the line's spectrum pass, and how much."""
+
+    length: int  # samples of a line that are used
+    padded: int  # FFT length
+    first: int  # first bin that passes
+    gain: Floats  # of each bin that passes
+    centre: int  # the bin of the carrier
+    out_length: int  # FFT length of the envelope
+    rate_hz: float
+    carrier_hz: float
+
+
+def check_acquisition(acquisition: Acquisition) -> None:
+    """Refuse an acquisition whose numbers cannot be those of a pulse-echo line.
+
+    Raises
+    ------
+    InputError
+        Sampling rate or transducer frequency missing or below Nyquist, or a forerun without its speed of sound.
+    """
+    sampling, centre = acquisition.sampling_hz, acquisition.transducer_hz
+    if not (np.isfinite(sampling) and 1e5 <= sampling <= 1e10):
+        raise InputError(f"SamplingFrequencyHz is {sampling}; expected the sampling rate in Hz, for example 60000000")
+    if not (np.isfinite(centre) and 1e4 <= centre):
+        raise InputError(f"TransducerFrequencyHz is {centre}; expected the transducer's frequency in Hz, for example 5000000")
+    if centre * 2.0 > sampling:
+        raise InputError(
+            f"TransducerFrequencyHz {centre:g} is above half of SamplingFrequencyHz {sampling:g}; the lines cannot hold its echoes"
+        )
+    length, speed = acquisition.forerun_length_mm, acquisition.forerun_speed_m_s
+    if length < 0 or not np.isfinite(length) or (length > 0 and not 500 <= speed <= 10000):
+        raise InputError(
+            f"ForerunLengthMm {length} with ForerunSpeedOfSoundMps {speed}: expected a length in mm and a speed of 500 to 10000 m/s"
+        )
+
+
+def design_band(acquisition: Acquisition, samples: int, until_s: float) -> Band:
+    """The band-pass for lines of `samples` samples of which the part before `until_s` is wanted."""
+    sampling, centre = acquisition.sampling_hz, acquisition.transducer_hz
+    length = min(samples, int(np.ceil(until_s * sampling)))
+    padded = int(fft.next_fast_len(length + int(3 * sampling / centre), real=True))
+    step = sampling / padded
+    first = max(1, int(np.ceil(BAND_EDGES[0] * centre / step)))
+    last = min(padded // 2, int(BAND_EDGES[1] * centre / step))
+    frequencies = np.arange(first, last) * step
+    sigma = BAND_WIDTH * centre / 2.3548 * np.sqrt(2.0) / 1.0
+    gain = np.exp(-0.5 * ((frequencies - BAND_CENTRE * centre) / (sigma / np.sqrt(2.0))) ** 2)
+    middle = round(BAND_CENTRE * centre / step)
+    out_length = int(fft.next_fast_len(max(int(np.ceil(OVERSAMPLING * centre / step)), last - first)))
+    return Band(
+        length=length,
+        padded=padded,
+        first=first,
+        gain=(2.0 * gain).astype(np.float32),  # twice: the negative frequencies are left out
+        centre=middle,
+        out_length=out_length,
+        rate_hz=out_length * step,
+        carrier_hz=middle * step,
+    )
+
+
+def complex_envelopes(lines: npt.NDArray[np.int16], band: Band) -> Envelopes:
+    """Complex envelopes of RF lines (n, N): DC and drift removed, band-passed without phase, demodulated."""
+    rf = remove_drift(lines[:, : band.length])
+    spectrum = fft.rfft(rf, n=band.padded, axis=1)[:, band.first : band.first + len(band.gain)] * band.gain
+    shifted = np.zeros((len(rf), band.out_length), dtype=np.complex64)
+    below = band.centre - band.first
+    shifted[:, : len(band.gain) - below] = spectrum[:, below:]
+    shifted[:, band.out_length - below :] = spectrum[:, :below]
+    scale = np.float32(band.out_length / band.padded)
+    values = fft.ifft(shifted, axis=1, overwrite_x=True) * scale
+    keep = min(band.out_length, int(np.ceil(band.length * band.out_length / band.padded)))
+    return Envelopes(values=values[:, :keep], rate_hz=band.rate_hz, carrier_hz=band.carrier_hz)
+
+
+def remove_drift(lines: npt.NDArray[np.int16]) -> Floats:
+    """Lines as float32 without their straight-line drift, which is taken from the quiet second half."""
+    rf = lines.astype(np.float32)
+    quarter = max(rf.shape[1] // 4, 1)
+    third = rf[:, -2 * quarter : -quarter].mean(axis=1)
+    fourth = rf[:, -quarter:].mean(axis=1)
+    slope = (fourth - third) / quarter
+    base = fourth - slope * (rf.shape[1] - quarter / 2)
+    rf -= base[:, None]
+    rf -= slope[:, None] * np.arange(rf.shape[1], dtype=np.float32)
+    return rf
