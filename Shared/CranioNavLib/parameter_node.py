@@ -16,6 +16,8 @@ from CranioNavLib.scene import Observation
 
 P = TypeVar("P", bound=Parameters)
 
+ABSENT = "(none)"  # the text of an optional parameter that is None
+
 
 class ParameterNode(Generic[P]):
     """The door between a `Parameters` dataclass and the node that holds it.
@@ -41,13 +43,19 @@ class ParameterNode(Generic[P]):
         InputError
             The node holds a value outside its limits or of another type (a scene from elsewhere).
         """
-        texts = {}
+        texts: dict[str, str] = {}
+        nothing: dict[str, Any] = {}
+        stored = set(self.node.GetParameterNames())
         for info in self.kind.describe():
+            if self.prefix + info.name not in stored:
+                continue
             text = self.node.GetParameter(self.prefix + info.name)
-            if text is not None and text != "":
+            if text == ABSENT and info.optional:
+                nothing[info.name] = None
+            else:
                 texts[info.name] = text
         try:
-            return self.kind.from_strings(texts)
+            return replace(self.kind.from_strings(texts), **nothing)
         except InputError as error:
             raise InputError(f"parameters of {self.node.GetName()} in the scene: {error}; reset it") from None
 
@@ -57,7 +65,7 @@ class ParameterNode(Generic[P]):
         texts = parameters.to_strings()
         with host.slicer_package().util.NodeModify(self.node):
             for info in self.kind.describe():
-                self.node.SetParameter(self.prefix + info.name, texts.get(info.name, ""))
+                self.node.SetParameter(self.prefix + info.name, texts.get(info.name, ABSENT))
 
     def change(self, **values: Any) -> P:
         """Store some fields, keep the others; returns all. The values are checked before anything is stored."""

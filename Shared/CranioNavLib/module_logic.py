@@ -1,0 +1,33 @@
+"""What the logics of the three modules have in common: parameters by type, plugins made from the scene's settings."""
+
+from __future__ import annotations
+
+from typing import Any, Generic, TypeVar
+
+from CranioNavLib import scene
+from CranioNavLib.panel_model import settings_prefix
+from CranioNavLib.parameter_node import ParameterNode
+from CranioNavLib.parameters import Parameters
+from CranioNavLib.plugins import KINDS
+
+P = TypeVar("P", bound=Parameters)
+
+
+class ParametersInScene(Generic[P]):
+    """To be mixed into a ScriptedLoadableModuleLogic; `parameterClass` says what its parameters are."""
+
+    parameterClass: type[P]
+    sessionRole: str = ""  # the role of the module's parameter node in the scene
+    refusals: tuple[type[Exception], ...] = ()  # beside InputError: what the module's devices raise
+
+    def parameters(self) -> ParameterNode[P]:
+        """The door to the module's parameters in the scene."""
+        node: Any = self.getParameterNode()  # type: ignore[attr-defined]
+        if node.GetAttribute(scene.ROLE_ATTRIBUTE) != self.sessionRole:
+            node.SetAttribute(scene.ROLE_ATTRIBUTE, self.sessionRole)
+        return ParameterNode(node, self.parameterClass)
+
+    def createPlugin(self, kind: str, name: str) -> Any:
+        """A plugin of a kind with the settings that the scene keeps for it."""
+        plugin = KINDS[kind].find(name)
+        return plugin(ParameterNode(self.parameters().node, plugin.Settings, settings_prefix(kind, name)).read())

@@ -1,0 +1,236 @@
+"""A panel at work: its description bound to a module's logic. Renderers draw it and pass on what the user does.
+
+A renderer builds its widgets from `model.panel`, asks `value`, `reading`, `status`, `blocked` and `node` for what to show,
+passes edits to `change`, `choose` and `run`, and redraws when a listener is called. It needs no other rule.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from CranioNavLib import scene
+from CranioNavLib.errors import InputError
+from CranioNavLib.panel import (
+    Action,
+    Cancelled,
+    Field,
+    Level,
+    NodeField,
+    Panel,
+    PluginField,
+    Progress,
+    Reading,
+    ReadOut,
+    Step,
+    StepState,
+    StepStatus,
+    Task,
+)
+from CranioNavLib.parameter_node import ParameterNode
+from CranioNavLib.parameters import ParameterInfo, Parameters
+from CranioNavLib.plugins import KINDS
+
+LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Message:
+    """The last thing that an action or an edit had to say."""
+
+    text: str
+    level: Level
+
+
+class Runner(Protocol):
+    """Runs `compute` in another thread and calls `finished(result or exception)` in the thread that owns the scene."""
+
+    def start(self, compute: Callable[[], Any], finished: Callable[[Any], None]) -> None:
+        """Return at once."""
+
+
+class PanelModel:
+    """One panel and one logic.
+
+    Parameters
+    ----------
+    panel : Panel
+    logic : object
+        Has the methods that the panel names, and `parameters()`, which returns a ParameterNode.
+    runner : Runner, optional
+        For long work. Without one, an action returns when all is done.
+    """
+
+    def __init__(self, panel: Panel, logic: Any, runner: Runner | None = None) -> None:
+        self.panel, self.logic, self.runner = panel, logic, runner
+        self.message = Message("", Level.PLAIN)
+        self.errors: dict[str, str] = {}  # field name -> why the last edit was refused
+        self.busy: Action | None = None
+        self.progress = Progress()
+        self._listeners: list[Callable[[], None]] = []
+        self._refusals: tuple[type[Exception], ...] = (InputError, *getattr(logic, "refusals", ()))
+
+    # Fields
+
+    def describe(self, field: Field) -> ParameterInfo:
+        """Type, limits, unit and help of a field."""
+        return self.panel.parameter(field.name)
+
+    def value(self, field: Field) -> Any:
+        """The field's value in the scene."""
+        return getattr(self._parameters().read(), field.name)
+
+    def change(self, field: Field, value: Any) -> bool:
+        """Store an edit; False, with `errors[field.name]` set, if it is refused."""
+        return self._store(field.name, self._parameters(), field.name, value)
+
+    def choices(self, field: PluginField) -> list[str]:
+        """Names of the plugins that can be chosen."""
+        return list(KINDS[field.kind].names())
+
+    def settings(self, field: PluginField) -> ParameterNode[Parameters] | None:
+        """Where the chosen plugin's own settings are kept; None if the plugin cannot be loaded."""
+        name = self.value(field)
+        try:
+            kind = KINDS[field.kind].find(name).Settings
+        except (InputError, ImportError) as error:
+            self.errors[field.name] = str(error)
+            return None
+        return ParameterNode(self._parameters().node, kind, settings_prefix(field.kind, name))
+
+    def change_setting(self, field: PluginField, name: str, value: Any) -> bool:
+        """Store an edit of the chosen plugin's settings; False, with `errors["<plugin field>.<name>"]` set, if refused."""
+        door = self.settings(field)
+        return door is not None and self._store(f"{field.name}.{name}", door, name, value)
+
+    # Nodes
+
+    def node(self, field: NodeField) -> Any | None:
+        """The node that plays the role now."""
+        return scene.find(field.role)
+
+    def choose(self, field: NodeField, node: Any | None) -> bool:
+        """Let another node play the role; False, with a message, if it is of another class."""
+        if node is None or node is self.node(field):
+            return True
+        return self._guarded(lambda: scene.assign(field.role, node))
+
+    # Actions
+
+    def blocked(self, action: Action) -> str:
+        """Why the action cannot be used now; "" if it can."""
+        if self.busy is not None:
+            return f"{self.busy.label} is still running"
+        companion = getattr(self.logic, f"{action.name}Blocked", None)
+        return str(companion()) if companion is not None else ""
+
+    def run(self, action: Action) -> bool:
+        """Do what the button says; False, with a message, if it is refused. Long work goes to the runner."""
+        reason = self.blocked(action)
+        if reason:
+            self._say(reason, Level.WARNING)
+            return False
+        return self._guarded(lambda: self._perform(action))
+
+    def cancel(self) -> None:
+        """Ask the long work under way to stop."""
+        self.progress.cancel()
+
+    # Read-outs and steps
+
+    def reading(self, read_out: ReadOut) -> Reading | None:
+        """What a read-out shows now; None: nothing yet."""
+        try:
+            return getattr(self.logic, read_out.name)()  # type: ignore[no-any-return]
+        except self._refusals as error:
+            return Reading(str(error), Level.BAD)
+
+    def status(self, step: Step) -> StepStatus:
+        """The state of a step."""
+        if not step.status:
+            return StepStatus(StepState.TODO)
+        try:
+            return getattr(self.logic, step.status)()  # type: ignore[no-any-return]
+        except self._refusals as error:
+            return StepStatus(StepState.ATTENTION, str(error))
+
+    # Listeners
+
+    def listen(self, callback: Callable[[], None]) -> None:
+        """Call `callback()` when something may have to be drawn anew."""
+        self._listeners.append(callback)
+
+    def forget(self, callback: Callable[[], None]) -> None:
+        """No more calls."""
+        self._listeners = [listener for listener in self._listeners if listener != callback]
+
+    def notify(self) -> None:
+        """Let all listeners draw anew."""
+        for listener in list(self._listeners):
+            listener()
+
+    def _parameters(self) -> ParameterNode[Parameters]:
+        door: ParameterNode[Parameters] = self.logic.parameters()
+        return door
+
+    def _store(self, key: str, door: ParameterNode[Parameters], name: str, value: Any) -> bool:
+        try:
+            door.change(**{name: value})
+        except InputError as error:
+            self.errors[key] = str(error)
+            self.notify()
+            return False
+        self.errors.pop(key, None)
+        self.notify()
+        return True
+
+    def _guarded(self, work: Callable[[], object]) -> bool:
+        try:
+            work()
+        except Cancelled as cancelled:
+            self._say(str(cancelled), Level.WARNING)
+            return False
+        except self._refusals as error:
+            self._say(str(error), Level.BAD)
+            return False
+        return True
+
+    def _perform(self, action: Action) -> None:
+        self.message = Message("", Level.PLAIN)
+        result = getattr(self.logic, action.name)()
+        if not isinstance(result, Task):
+            self._say(result or "", Level.GOOD)
+            return
+        self.progress = progress = Progress()
+        if self.runner is None:
+            self._say(result.run(progress) or "", Level.GOOD)
+            return
+        self.busy = action
+        self.runner.start(lambda: result.compute(progress), lambda outcome: self._finish(result, outcome))
+        self.notify()
+
+    def _finish(self, task: Task, outcome: Any) -> None:
+        """In the scene's thread: what a runner brought back becomes nodes, or a message."""
+        self.busy = None
+
+        def bring_in() -> None:
+            if isinstance(outcome, BaseException):
+                raise outcome
+            self._say(task.apply(outcome) or "", Level.GOOD)
+
+        try:
+            self._guarded(bring_in)
+        except Exception as error:
+            LOG.exception("%s failed", task.title)
+            self._say(f"{task.title} failed: {type(error).__name__}: {error}; this is a defect, please report it", Level.BAD)
+
+    def _say(self, text: str, level: Level) -> None:
+        self.message = Message(text, level if text else Level.PLAIN)
+        self.notify()
+
+
+def settings_prefix(kind: str, plugin: str) -> str:
+    """Under which a plugin's settings are kept in its module's parameter node."""
+    return f"{kind}.{plugin}."
