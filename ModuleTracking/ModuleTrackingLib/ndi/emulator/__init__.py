@@ -1,0 +1,1 @@
+"""An emulated Polaris: the device, the motion that it sees, faults on demand, and the lines that it serves."""

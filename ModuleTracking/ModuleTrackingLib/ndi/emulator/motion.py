@@ -1,0 +1,131 @@
+"""What the emulated camera sees: tools that move by a script, or poses played from a CSV file in a loop."""
+
+from __future__ import annotations
+
+import bisect
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Optional, Protocol
+
+import numpy as np
+from CranioNavLib.errors import InputError
+
+from ModuleTrackingLib.ndi.tracking import RawPose
+
+COLUMNS = ("timestamp_s", "tool", "status", "qw", "qx", "qy", "qz", "tx_mm", "ty_mm", "tz_mm", "error_mm")
+
+
+class Motion(Protocol):
+    """Tools and where they are."""
+
+    tools: tuple[str, ...]
+    rate_hz: float  # frames a second
+
+    def sample(self, time_s: float) -> tuple[int, dict[str, Optional[RawPose]]]:
+        """The newest frame at that time since tracking began: its number from 0, and each tool's pose or None."""
+
+
+class HandMotion:
+    """Four tools of a navigated operation, moved as if by hand: smooth, bounded, and the same every time.
+
+    The reference base sways a little about its place; probe, stylus and sphere wander and tilt about theirs.
+    """
+
+    def __init__(self, rate_hz: float = 60.0, tools: tuple[str, ...] = ("Reference", "Probe", "Stylus", "Sphere")) -> None:
+        self.tools, self.rate_hz = tools, rate_hz
+
+    def sample(self, time_s: float) -> tuple[int, dict[str, Optional[RawPose]]]:
+        """See Motion.sample."""
+        frame = max(0, math.floor(time_s * self.rate_hz + 1e-6))
+        return frame, {tool: self._pose(index, tool, frame / self.rate_hz) for index, tool in enumerate(self.tools)}
+
+    def _pose(self, index: int, tool: str, time_s: float) -> RawPose:
+        steady = tool == "Reference"
+        reach_mm, tilt_rad = (0.3, 0.002) if steady else (60.0, 0.5)
+        phase = 1.7 * index
+        swing = [math.sin(speed * time_s + phase + turn) for speed, turn in ((0.61, 0.0), (0.83, 1.0), (1.09, 2.0))]
+        half = np.asarray(swing) * tilt_rad / 2 + np.array([0.2, -0.1, 0.3]) * (index + 1) / 2
+        angle = float(np.linalg.norm(half))
+        vector = half / angle * math.sin(angle) if angle else half
+        place = (120.0 * index - 180.0, 40.0 - 25.0 * index, -1100.0 - 30.0 * index)
+        x, y, z = (home + reach_mm * swing[(axis + 1) % 3] for axis, home in enumerate(place))
+        return RawPose((math.cos(angle), float(vector[0]), float(vector[1]), float(vector[2])), (x, y, z), 0.1 + 0.02 * index)
+
+
+@dataclass(frozen=True)
+class _Row:
+    time_s: float
+    tool: str
+    pose: Optional[RawPose]
+
+
+class ReplayedMotion:
+    """Poses from a CSV file, each shown exactly as it stands there until the next one's time, in a loop.
+
+    Rows with one time stamp are one frame. The frame rate is that of the file's median step, so that
+    gaps in the file show as jumps of the frame number.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        rows = _read_rows(Path(path))
+        self.tools = tuple(dict.fromkeys(row.tool for row in rows))
+        times = sorted({row.time_s for row in rows})
+        steps = np.diff(times)
+        self.rate_hz = float(1.0 / np.median(steps)) if len(steps) else 60.0
+        self._times = [time - times[0] for time in times]
+        frames: dict[float, dict[str, Optional[RawPose]]] = {time: dict.fromkeys(self.tools) for time in times}
+        for row in rows:
+            frames[row.time_s][row.tool] = row.pose
+        self._frames = [frames[time] for time in times]
+        self._numbers = [0]
+        for time in self._times[1:]:
+            self._numbers.append(max(self._numbers[-1] + 1, round(time * self.rate_hz)))
+        self.duration_s = self._times[-1] + 1.0 / self.rate_hz
+
+    def sample(self, time_s: float) -> tuple[int, dict[str, Optional[RawPose]]]:
+        """See Motion.sample."""
+        loops, within = divmod(max(0.0, time_s), self.duration_s)
+        index = bisect.bisect_right(self._times, within + 1e-9) - 1
+        return int(loops) * (self._numbers[-1] + 1) + self._numbers[index], self._frames[index]
+
+
+def _read_rows(path: Path) -> list[_Row]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            table = csv.DictReader(file)
+            missing = [name for name in COLUMNS if name not in (table.fieldnames or ())]
+            if missing:
+                raise InputError(f"{path}: a pose CSV needs the columns {', '.join(COLUMNS)}; missing: {', '.join(missing)}")
+            rows = [_row(path, number, fields) for number, fields in enumerate(table, start=2)]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"cannot read the pose CSV {path}: {error}; give a file that `tracker record --csv` wrote") from None
+    if not rows:
+        raise InputError(f"{path} holds no poses; record some first")
+    return rows
+
+
+def _row(path: Path, line: int, fields: dict[str, Optional[str]]) -> _Row:
+    try:
+        time_s, tool, status = (
+            float(fields["timestamp_s"] or ""),
+            (fields["tool"] or "").strip(),
+            (fields["status"] or "").strip(),
+        )
+        if not math.isfinite(time_s) or not tool:
+            raise ValueError("no time or no tool")
+        if status != "OK":
+            return _Row(time_s, tool, None)
+        qw, qx, qy, qz, x, y, z = (float(fields[name] or "") for name in COLUMNS[3:10])
+        error = float(fields["error_mm"] or 0.0)
+    except ValueError as problem:
+        raise InputError(f"{path}, line {line}: {problem}; expected {','.join(COLUMNS)}") from None
+    length = math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
+    if not all(map(math.isfinite, (x, y, z, length))) or abs(length - 1.0) > 0.01:
+        raise InputError(f"{path}, line {line}: the quaternion has length {length:.4g}, expected 1, and finite coordinates")
+    return _Row(
+        time_s,
+        tool,
+        RawPose((qw / length, qx / length, qy / length, qz / length), (x, y, z), error if math.isfinite(error) else 0.0),
+    )
