@@ -1,0 +1,1 @@
+"""The standalone application: command line and, on top of the same modules, the web workstation."""

@@ -28,7 +28,7 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.parameters import Parameters
 
 
-class Plugin(ABC):
+class Plugin(ABC):  # noqa: B024 - the abstract methods are those of each kind's base
     """What every plugin has, whatever its kind."""
 
     name: ClassVar[str] = ""  # as the user types it: lower case, digits, hyphens

@@ -1,0 +1,138 @@
+"""The case folder: one registration on disk, as `register` and `batch` read it and the workstation saves it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Optional
+
+from CranioNavLib.errors import InputError
+from CranioNavLib.slicer_files import LabelledPoints, read_points
+
+# name of a thing in case.json -> the file names it may have in the folder
+FILES = {
+    "ct": ("ct.nrrd", "ct.nii.gz", "ct.nii", "ct.mha", "ct"),
+    "landmarks-ct": ("landmarks-ct.mrk.json", "landmarks-ct.fcsv"),
+    "landmarks-patient": ("landmarks-patient.mrk.json", "landmarks-patient.fcsv"),
+    "points": ("points.mrk.json", "points.fcsv"),
+    "palpation": ("palpation.igs.mha", "palpation.igs.mhd", "palpation.mha"),
+    "targets-ct": ("targets-ct.mrk.json", "targets-ct.fcsv"),
+    "targets-patient": ("targets-patient.mrk.json", "targets-patient.fcsv"),
+    "plausibility": ("plausibility.mrk.json", "plausibility.fcsv"),
+}
+REQUIRED = ("ct", "landmarks-ct", "landmarks-patient")
+MODES = ("Ia", "Ib", "IIa", "IIb", "III")
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What a case folder holds. Point lists are in RAS (…-ct) or Reference (the others), mm."""
+
+    folder: Path
+    ct: Path
+    landmarks_ct: LabelledPoints
+    landmarks_patient: LabelledPoints
+    points: Optional[LabelledPoints] = None
+    palpation: Optional[Path] = None
+    targets_ct: Optional[LabelledPoints] = None
+    targets_patient: Optional[LabelledPoints] = None
+    plausibility: Optional[LabelledPoints] = None
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self.folder.resolve().name
+
+    def mode(self, wanted: Optional[str] = None) -> str:
+        """The registration mode: the wanted one if the folder has what it needs, else the richest there is.
+
+        Raises
+        ------
+        InputError
+            An unknown mode, or one whose file is missing.
+        """
+        if wanted is None:
+            return "III" if self.palpation else "IIb" if self.points else "IIa"
+        known = {mode.lower(): mode for mode in MODES}
+        if wanted.lower() not in known:
+            raise InputError(f"unknown mode {wanted!r}; choose one of {', '.join(MODES)}")
+        mode = known[wanted.lower()]
+        if mode == "III" and self.palpation is None:
+            raise InputError(
+                f"mode III needs an A-mode recording, and {self.folder} has none; add palpation.igs.mha or choose --mode IIa"
+            )
+        if mode == "IIb" and self.points is None:
+            raise InputError(
+                f"mode IIb needs palpated points, and {self.folder} has none; add points.mrk.json or choose --mode IIa"
+            )
+        return mode
+
+
+def find_files(folder: Path) -> dict[str, Path]:
+    """Path of everything the case names or holds.
+
+    Raises
+    ------
+    InputError
+        No folder, a broken case.json, a redirection that leads nowhere, or something required is missing.
+    """
+    if not folder.is_dir():
+        raise InputError(f"no case folder {folder}; give a folder that holds a CT and the landmark lists")
+    redirected = _read_redirections(folder)
+    found: dict[str, Path] = {}
+    for thing, names in FILES.items():
+        if thing in redirected:
+            path = folder / redirected[thing]
+            if not path.exists():
+                raise InputError(
+                    f"{folder / 'case.json'} says {thing} is {redirected[thing]}, but there is no {path}; correct the path"
+                )
+            found[thing] = path
+        else:
+            present = [folder / name for name in names if (folder / name).exists()]
+            if present:
+                found[thing] = present[0]
+    for thing in REQUIRED:
+        if thing not in found:
+            raise InputError(
+                f"case folder {folder} has no {' or '.join(FILES[thing][:1] + FILES[thing][-1:])}; add it, or name it in case.json"
+            )
+    return found
+
+
+def _read_redirections(folder: Path) -> dict[str, str]:
+    path = folder / "case.json"
+    if not path.exists():
+        return {}
+    try:
+        redirected = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f'cannot read {path}: {error}; expected JSON such as {{"ct": "../ct.nrrd"}}') from None
+    if not isinstance(redirected, dict):
+        raise InputError(f'{path} must hold one JSON object such as {{"ct": "../ct.nrrd"}}')
+    # a name may be given as the thing ("ct") or as the file it stands for ("landmarks-ct.mrk.json")
+    by_name = {name: thing for thing, names in FILES.items() for name in (thing, *names)}
+    known = {by_name[key]: value for key, value in redirected.items() if key in by_name}
+    for thing, value in known.items():
+        if not isinstance(value, str):
+            raise InputError(f"{path}: {thing} must be a path in quotes, got {value!r}")
+    return known
+
+
+def read_case(folder: str | Path) -> Case:
+    """The case in `folder`: point lists read, CT and recording found but not yet read.
+
+    Raises
+    ------
+    InputError
+        What find_files refuses, or a point list that cannot be read.
+    """
+    folder = Path(folder)
+    files = find_files(folder)
+    lists = {
+        thing.replace("-", "_"): read_points(path)
+        for thing, path in files.items()
+        if thing not in ("ct", "palpation")
+    }  # fmt: skip
+    return Case(folder=folder, ct=files["ct"], palpation=files.get("palpation"), **lists)

@@ -1,0 +1,48 @@
+"""`cranionav register`: one case folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+
+def register(
+    case: Annotated[Path, typer.Argument(metavar="CASE", help="case folder")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="where the result goes")],
+    method: Annotated[Optional[str], typer.Option(help="registration plugin; see `cranionav plugins`")] = None,
+    mode: Annotated[Optional[str], typer.Option(help="Ia, Ib, IIa, IIb or III; default: the richest the case allows")] = None,
+    segmentation: Annotated[str, typer.Option(help="segmentation plugin")] = "threshold",
+    json: Annotated[bool, typer.Option("--json", help="print registration.json on stdout")] = False,
+) -> int:
+    """Register a case; write the transform, registration.json, scene.mrb and report.html.
+
+    A registration that is refused ends with exit status 2 and leaves no transform file.
+    """
+    from CranioNavLib.case import read_case
+    from CranioNavLib.files import output_folder
+    from ModuleRegistrationLib.procedure import register_case
+
+    from Workstation.outputs import write_outputs
+    from Workstation.terminal import print_json, progress_bar
+
+    folder = output_folder(output)
+    with progress_bar() as say:
+        result = register_case(read_case(case), mode, method, segmentation, progress=lambda step, share: say(step, 0.7 * share))
+        record = write_outputs(result, folder, progress=lambda step, share: say(step, 0.7 + 0.3 * share))
+    if json:
+        print_json(record)
+    else:
+        _say(record, folder)
+    return 2 if result.verdict.status == "refused" else 0
+
+
+def _say(record: dict[str, object], folder: Path) -> None:
+    import sys
+
+    from Workstation.outputs import print_result
+
+    print_result([record], folder)
+    if record["status"] == "refused":
+        print(f"cranionav: registration refused: {'; '.join(map(str, record['messages']))}", file=sys.stderr)  # type: ignore[call-overload]

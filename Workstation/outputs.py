@@ -1,0 +1,93 @@
+"""Everything that `register` and `batch` write for a case, and what they print."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Optional
+
+from CranioNavLib.files import output_folder, write_text, written_whole
+
+from Workstation.results import RECORD_KEYS, versions, write_registration
+
+if TYPE_CHECKING:
+    from ModuleRegistrationLib.procedure import CaseResult
+
+
+def write_outputs(
+    result: CaseResult,
+    folder: Path,
+    scene: bool = True,
+    notes: Mapping[str, str] | None = None,
+    progress: Optional[Callable[[str, float], None]] = None,
+) -> dict[str, Any]:
+    """Write transform, registration.json, scene.mrb (if asked) and report.html; return the registration record."""
+    from ModuleRegistrationLib.verification.report import write_report
+
+    say = progress or (lambda step, share: None)
+    record = write_registration(result, folder)
+    if scene:
+        from CranioNavLib.slicer_files import save_scene
+
+        from Workstation.case_scene import fill_scene
+
+        say("writing the scene", 0.1)
+        fill_scene(result)
+        save_scene(folder / "scene.mrb")
+    write_report(result, folder / "report.html", versions(), notes, progress=lambda step, share: say(step, 0.4 + 0.6 * share))
+    return record
+
+
+def write_failure(case: Path, folder: Path, status: str, message: str) -> dict[str, Any]:
+    """The record of a case that could not be registered: every key there, nothing claimed."""
+    record: dict[str, Any] = dict.fromkeys(RECORD_KEYS)
+    record.update(
+        case=case.resolve().name,
+        status=status,
+        messages=[message],
+        predicted_tre_mm=[],
+        predicted_tre_p95_mm=[],
+        tre_mm=[],
+        versions=versions(),
+    )
+    if folder.is_dir():
+        for left_over in ("ReferenceToRas.tfm", "report.html", "scene.mrb"):  # an earlier call's result is not this one's
+            (folder / left_over).unlink(missing_ok=True)
+        write_text(folder / "registration.json", json.dumps(record, indent=2) + "\n")
+    return record
+
+
+def write_table(
+    folder: Path, name: str, record: Mapping[str, Any], columns: Sequence[str], rows: Sequence[Sequence[Any]]
+) -> None:
+    """`name`.json with the whole record and `name`.csv with its rows."""
+    output_folder(folder)
+    write_text(folder / f"{name}.json", json.dumps(record, indent=2) + "\n")
+    with written_whole(folder / f"{name}.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def print_result(records: Sequence[Mapping[str, Any]], folder: Path) -> None:
+    """One line a case, and where the files are."""
+    from Workstation.terminal import number, print_table
+
+    columns = ["case", "mode", "method", "status", "TRE mean", "TRE max", "predicted", "95%", "points", "c (m/s)", "time (s)"]
+    rows = []
+    for record in records:
+        predicted, p95 = record.get("predicted_tre_mm") or [], record.get("predicted_tre_p95_mm") or []
+        rows.append([
+            str(record["case"]), record["mode"] or "–", record["method"] or "–", str(record["status"]),
+            number(record["tre_mean_mm"]), number(record["tre_max_mm"]),
+            number(sum(predicted) / len(predicted) if predicted else None), number(max(p95, default=None)),
+            f"{record['points_used']}" if record["points_used"] is not None else "–",
+            number(record["speed_of_sound_m_s"], 0), number(record["duration_s"], 1),
+        ])  # fmt: skip
+    print_table("Registration (TRE and its prediction in mm; 95%: at the worst target)", columns, rows)
+    for record in records:
+        for message in record["messages"]:
+            print(f"{record['case']}: {message}")
+    print(f"files: {folder}")
