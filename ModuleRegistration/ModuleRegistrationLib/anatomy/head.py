@@ -1,0 +1,142 @@
+"""The head in a CT: what is patient, how deep a point lies under the skin, and which way the skin is."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from CranioNavLib.errors import InputError
+from CranioNavLib.rigid import Array
+from CranioNavLib.volume import Volume
+
+from ModuleRegistrationLib.anatomy.grid import Grid, Mask, sample, sample_linear, subsampled
+
+AIR_TISSUE_HU = -300  # above foam cushions (about -650) and hair, below fat (-120)
+COARSE_MM = 2.5
+NECK_MM = 4.0  # what hangs on the head by less than twice this (holder, straps, tubes, ear rims) is cut off
+REGROW_MM = 4.0  # how far the cut is undone along the tissue, so that nose and brow keep their shape
+ORIFICE_MM = 6.0  # nostrils and ear canals up to twice this wide are closed
+SINUS_MM2 = 4000.0  # an air space within one slice up to this area belongs to the head (a nasal cavity has about 1500)
+SMALLEST_HEAD_ML, LARGEST_HEAD_ML = 150.0, 20000.0  # a slab of a small head; a head with shoulders
+
+
+@dataclass(frozen=True, eq=False)
+class Head:
+    """The patient's tissue on a grid of about 2.5 mm, air-filled cavities included."""
+
+    grid: Grid
+    mask: Mask  # (K, J, I)
+    depth_mm: npt.NDArray[np.float32]  # (K, J, I) distance to the skin: positive inside, negative outside
+
+    def depth_at(self, points_mm: Array) -> Array:
+        """(N,) depth under the skin of points (N, 3) in RAS, mm; negative outside the head."""
+        return sample_linear(self.depth_mm, self.grid.to_index(points_mm))
+
+    def contains(self, points_mm: Array) -> Mask:
+        """(N,) whether points (N, 3) in RAS lie in the head."""
+        return np.asarray(sample(self.mask, self.grid.to_index(points_mm)), dtype=bool)
+
+    def towards_skin(self, points_mm: Array) -> Array:
+        """(N, 3) unit vectors in RAS from points to where the skin is nearest."""
+        spacing = self.grid.spacing_mm
+        index = self.grid.to_index(points_mm)
+        slope = np.empty((len(index), 3))
+        for axis in range(3):
+            step = np.zeros(3)
+            step[axis] = 3.0 / spacing[axis]  # 3 mm: more than a step of the mask
+            rise = sample_linear(self.depth_mm, index - step) - sample_linear(self.depth_mm, index + step)
+            slope[:, axis] = rise
+        slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
+        return self.grid.direction_to_ras(slope)
+
+
+def find_head(volume: Volume) -> Head:
+    """The head, without holder, table, cushions and air; its sinuses and orifices belong to it.
+
+    Raises
+    ------
+    InputError
+        Nothing of a head's size is denser than air.
+    """
+    full = Grid.of(volume)
+    strides = full.strides(COARSE_MM)
+    grid = full.coarser(strides)
+    tissue = _fill_slices(subsampled(volume.hu, strides) > AIR_TISSUE_HU, grid, SINUS_MM2)
+    spacing = grid.spacing_mm
+    core = _largest(signed_distance(tissue, spacing) > NECK_MM)
+    volume_ml = float(core.sum()) * grid.voxel_mm3 / 1000
+    if volume_ml < SMALLEST_HEAD_ML:
+        raise InputError(
+            f"the CT holds no head: the largest connected tissue is {volume_ml:.0f} ml, expected at least "
+            f"{SMALLEST_HEAD_ML:.0f} ml; give a CT of the head in Hounsfield units"
+        )
+    if volume_ml > LARGEST_HEAD_ML:
+        raise InputError(
+            f"the CT's tissue is {volume_ml / 1000:.1f} l, more than a head; check the voxel spacing "
+            f"({', '.join(f'{s:.2f}' for s in full.spacing_mm[::-1])} mm) and give a CT of the head"
+        )
+    body = tissue & (signed_distance(core, spacing) > -(NECK_MM + REGROW_MM))
+    mask = _fill(body, grid)
+    return Head(grid, mask, signed_distance(mask, spacing))
+
+
+def signed_distance(mask: Mask, spacing_mm: Array) -> npt.NDArray[np.float32]:
+    """Distance (mm) to the mask's edge, positive inside, negative outside. The array's border is no edge.
+
+    Masks that are empty or full have no edge: -inf or +inf everywhere.
+    """
+    if not mask.any() or mask.all():
+        return np.full(mask.shape, np.inf if mask.any() else -np.inf, dtype=np.float32)
+    sitk: Any = importlib.import_module("SimpleITK")
+    image = sitk.GetImageFromArray(mask.view(np.uint8))
+    image.SetSpacing([float(s) for s in spacing_mm[::-1]])
+    distance = sitk.SignedMaurerDistanceMap(image, insideIsPositive=True, squaredDistance=False, useImageSpacing=True)
+    result: npt.NDArray[np.float32] = sitk.GetArrayFromImage(distance).astype(np.float32, copy=False)
+    return result
+
+
+def _largest(mask: Mask) -> Mask:
+    from scipy import ndimage
+
+    labels, count = ndimage.label(mask)
+    if count == 0:
+        return mask
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return np.asarray(labels == int(np.argmax(sizes)))
+
+
+def _fill(body: Mask, grid: Grid) -> Mask:
+    """`body` with orifices closed and cavities filled, those that a clipped end opens included."""
+    from scipy import ndimage
+
+    spacing = grid.spacing_mm
+    pad = [(int(np.ceil(2 * ORIFICE_MM / s)),) * 2 for s in spacing]
+    swollen = signed_distance(np.pad(body, pad), spacing) > -ORIFICE_MM
+    closed = signed_distance(swollen, spacing) > ORIFICE_MM
+    inner = tuple(slice(low, -high) for low, high in pad)
+    mask = _fill_slices(body | closed[inner], grid, np.inf)
+    return np.asarray(ndimage.binary_fill_holes(mask), dtype=bool)
+
+
+def _fill_slices(mask: Mask, grid: Grid, up_to_mm2: float) -> Mask:
+    """`mask` with the holes of its transverse slices filled that are no larger than `up_to_mm2`.
+
+    Slice by slice, because the airway leaves the volume through the lowest slice.
+    """
+    from scipy import ndimage
+
+    axis, _ = grid.axis_of((0.0, 0.0, 1.0))
+    cell_mm2 = grid.voxel_mm3 / grid.spacing_mm[axis]
+    empty = np.moveaxis(~mask, axis, 0)
+    in_slice = np.zeros((3, 3, 3), dtype=bool)
+    in_slice[1] = ndimage.generate_binary_structure(2, 1)
+    labels, count = ndimage.label(empty, structure=in_slice)
+    keep = np.bincount(labels.ravel(), minlength=count + 1) * cell_mm2 > up_to_mm2
+    for border in (labels[:, 0], labels[:, -1], labels[:, :, 0], labels[:, :, -1]):
+        keep[border.ravel()] = True
+    keep[0] = False
+    return np.moveaxis(~keep[labels], 0, axis)
