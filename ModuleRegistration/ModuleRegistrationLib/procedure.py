@@ -158,7 +158,8 @@ def _method_for(mode: str, wanted: Optional[str]) -> str:
     if wanted not in (None, "procrustes"):
         METHODS.find(str(wanted))  # an unknown name is the first thing to say
         raise InputError(
-            f"mode {mode} uses paired points only, and method {wanted} needs surface points; choose --mode IIb or III, or leave --method out"
+            f"mode {mode} uses paired points only, and method {wanted} needs surface points; "
+            "choose --mode IIb or III, or leave --method out"
         )
     return "procrustes"
 

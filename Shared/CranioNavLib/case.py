@@ -96,7 +96,8 @@ def find_files(folder: Path) -> dict[str, Path]:
     for thing in REQUIRED:
         if thing not in found:
             raise InputError(
-                f"case folder {folder} has no {' or '.join(FILES[thing][:1] + FILES[thing][-1:])}; add it, or name it in case.json"
+                f"case folder {folder} has no {FILES[thing][0]} (or {', '.join(FILES[thing][1:])}); "
+                "add it, or say in case.json where it is"
             )
     return found
 

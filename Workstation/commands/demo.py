@@ -45,9 +45,8 @@ def demo(
     else:
         print_result([record], folder)
         if result.tre:
-            print(
-                f"TRE {number(result.tre.mean_mm)} ± {number(result.tre.sd_mm)} mm (max {number(result.tre.max_mm)}) at {len(result.tre.errors_mm)} simulated markers"
-            )
+            spread = f"{number(result.tre.mean_mm)} ± {number(result.tre.sd_mm)} mm (max {number(result.tre.max_mm)})"
+            print(f"TRE {spread} at {len(result.tre.errors_mm)} simulated markers")
         print(f"head: {head}; tracker, probe and patient simulated, seed {seed}; {time.monotonic() - started:.0f} s in all")
         print(f"report: {folder / 'report.html'}")
     if result.verdict.status == "refused":
