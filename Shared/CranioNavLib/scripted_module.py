@@ -54,7 +54,7 @@ class ScriptedLoadableModuleWidget:
         self.moduleName = type(self).__name__.removesuffix("Widget")
         self.developerMode = False
         if parent is None:
-            toolkit: Any = importlib.import_module("CranioNavLib.panel_qt").toolkit()
+            toolkit: Any = importlib.import_module("CranioNavLib.panel_qt_widgets").toolkit()
             parent = toolkit.QWidget()
             toolkit.QVBoxLayout(parent)
         self.parent = parent
