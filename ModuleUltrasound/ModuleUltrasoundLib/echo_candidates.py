@@ -1,4 +1,4 @@
-"""Echoes that may be the bone: the highest peaks of each line's envelope behind the skin, with what speaks for them."""
+"""Echoes that may be the bone: the most salient peaks of each line behind the skin, with what speaks for and against them."""
 
 from __future__ import annotations
 
@@ -11,71 +11,149 @@ from CranioNavLib.rigid import Array
 from ModuleUltrasoundLib.signal_chain import Envelopes, Floats
 
 CANDIDATES = 8  # echoes kept of a line
-RAYLEIGH_MEDIAN = 1.1774  # median of the envelope of noise, in standard deviations of one quadrature
-NOISE_BLOCKS = 8
+NOISE_BLOCKS = 10
+LOG_RAYLEIGH = 0.058  # mean of the logarithm of Rayleigh noise with unit quadratures: (ln 2 - Euler's constant) / 2
+GUARD_CYCLES = 2.5  # half length of a pulse: levels before and after an echo are taken outside of it
+NEAR_S = 3e-6  # length of the stretches before and after an echo: 2.3 mm
+SALIENCE_S = 2.5e-6  # an echo stands out over this much on both sides
+DECIBEL = 20 / np.log(10)
+TYPICAL_ATTENUATION = 1.0  # dB/cm/MHz; only ranks candidates, soft tissue has 0.3 to 2.6
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """K echoes of each of n lines, strongest first; NaN where a line has fewer."""
+    """K echoes of each of n lines, most salient first; NaN where a line has fewer."""
 
     delays_s: Array  # (n, K) after the skin
     amplitudes: Array  # (n, K) envelope
-    samples: npt.NDArray[np.int64]  # (n, K) index of the peak
+    phases: Array  # (n, K) phase of the RF at the echo's centre, rad
+    widths_s: Array  # (n, K) standard deviation of the Gaussian that fits the envelope's top
+    saliences_db: Array  # (n, K) over the mean level around
+    before_db: Array  # (n, K) mean level in the stretch just before, over the noise
+    after_db: Array  # (n, K) just behind
+    before_all_db: Array  # (n, K) from the skin to the echo
+    after_all_db: Array  # (n, K) from the echo to the end of the line
     noise: Array  # (n,) standard deviation of one quadrature
 
-
-def noise_level(magnitude: Floats) -> Array:
-    """Standard deviation of one quadrature of the noise of each line, from its quietest stretch, shape (n,)."""
-    count, length = magnitude.shape
-    block = max(length // NOISE_BLOCKS, 1)
-    blocks = magnitude[:, : block * (length // block)].reshape(count, -1, block)[:, 1:]
-    quiet = np.median(blocks, axis=2).min(axis=1)
-    return np.asarray(quiet / RAYLEIGH_MEDIAN, dtype=float) + 1e-6
+    @property
+    def snrs_db(self) -> Array:
+        """(n, K) envelope over the noise of one quadrature."""
+        return np.asarray(DECIBEL * np.log(np.maximum(self.amplitudes, 1e-9) / self.noise[:, None]))
 
 
-def find_peaks(magnitude: Floats, weights: Floats, first: int, last: int) -> npt.NDArray[np.int64]:
-    """Indices of the K highest local maxima of `magnitude * weights` in [first, last), shape (n, K); -1 pads."""
-    part = magnitude[:, first:last] * weights[first:last]
-    inner = part[:, 1:-1]
-    peak = (inner > part[:, :-2]) & (inner >= part[:, 2:])
-    score = np.where(peak, inner, 0)
-    keep = min(CANDIDATES, score.shape[1])
-    top = np.argpartition(-score, keep - 1, axis=1)[:, :keep]
-    heights = np.take_along_axis(score, top, axis=1)
-    order = np.argsort(-heights, axis=1)
-    top = np.take_along_axis(top, order, axis=1)
-    heights = np.take_along_axis(heights, order, axis=1)
-    return np.where(heights > 0, top + first + 1, -1)
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """Running sums of a batch's logarithmic envelope, from which mean levels of any stretch follow at once."""
+
+    log: Floats  # (n, M) natural logarithm of the envelope
+    sums: Floats  # (n, M + 1)
+
+    def mean(self, first: npt.NDArray[np.int64], last: npt.NDArray[np.int64]) -> Array:
+        """Mean logarithm over [first, last) of each line, indices (n, K); NaN for empty stretches."""
+        length = self.log.shape[1]
+        first, last = np.clip(first, 0, length), np.clip(last, 0, length)
+        total = np.take_along_axis(self.sums, last, axis=1) - np.take_along_axis(self.sums, first, axis=1)
+        return np.asarray(np.where(last > first, total / np.maximum(last - first, 1), np.nan), dtype=float)
+
+
+def take_levels(magnitude: Floats) -> Levels:
+    """Logarithmic levels of a batch of envelopes (n, M)."""
+    log = np.log(magnitude + np.float32(1e-3))  # a thousandth of a code: far below any converter's noise
+    sums = np.zeros((len(log), log.shape[1] + 1), dtype=np.float32)
+    np.cumsum(log, axis=1, out=sums[:, 1:])
+    return Levels(log, sums)
+
+
+def noise_level(levels: Levels) -> Array:
+    """Standard deviation of one quadrature of each line's noise, from its quietest stretch, shape (n,)."""
+    count, length = levels.log.shape
+    edges = np.linspace(0, length, NOISE_BLOCKS + 1).astype(np.int64)
+    means = (levels.sums[:, edges[1:]] - levels.sums[:, edges[:-1]]) / np.maximum(np.diff(edges), 1)
+    return np.asarray(np.exp(means.min(axis=1).astype(float) - LOG_RAYLEIGH))
 
 
 def refine_peaks(magnitude: Floats, samples: npt.NDArray[np.int64]) -> tuple[Array, Array]:
     """Sub-sample positions (in samples) and heights of peaks, by a parabola through the logarithm; NaN for padding."""
+    positions, heights, _ = _fit_tops(magnitude, samples)
+    return positions, heights
+
+
+def _fit_tops(magnitude: Floats, samples: npt.NDArray[np.int64]) -> tuple[Array, Array, Array]:
     safe = np.clip(samples, 1, magnitude.shape[1] - 2)
     left, mid, right = (np.log(np.take_along_axis(magnitude, safe + step, axis=1).astype(float) + 1e-9) for step in (-1, 0, 1))
-    curvature = left - 2 * mid + right
-    offset = np.where(curvature < -1e-9, 0.5 * (left - right) / np.minimum(curvature, -1e-9), 0.0)
-    offset = np.clip(offset, -0.5, 0.5)
+    curvature = np.minimum(left - 2 * mid + right, -1e-6)
+    offset = np.clip(0.5 * (left - right) / curvature, -0.5, 0.5)
     height = np.exp(mid - 0.25 * (left - right) * offset)
     bad = samples < 0
-    return np.where(bad, np.nan, safe + offset), np.where(bad, np.nan, height)
+    return np.where(bad, np.nan, safe + offset), np.where(bad, np.nan, height), np.where(bad, np.nan, np.sqrt(-1 / curvature))
 
 
-def find_candidates(envelopes: Envelopes, skin_s: Array, least_s: float, most_s: float, gain_db_per_s: float) -> Candidates:
-    """The strongest echoes `least_s` to `most_s` behind the skin echo of each line.
+def salient_peaks(levels: Levels, rate_hz: float, rise_db_per_s: float, first: int, last: int) -> npt.NDArray[np.int64]:
+    """Indices (n, K) of the local maxima in [first, last) that stand out most from what surrounds them; -1 pads.
+
+    Standing out is judged against the level around, so that a bone echo far below an interface near the skin is kept;
+    the level itself, raised by the tissue's attenuation, counts a little too.
+    """
+    reach = max(int(SALIENCE_S * rate_hz), 2)
+    index = np.arange(first + 1, last - 1)
+    low, high = np.clip(index - reach, 0, None), np.clip(index + reach + 1, None, levels.log.shape[1])
+    around = (levels.sums[:, high] - levels.sums[:, low]) / (high - low).astype(np.float32)
+    here = levels.log[:, first + 1 : last - 1]
+    rise = ((index - first) * (rise_db_per_s / rate_hz / DECIBEL)).astype(np.float32)
+    score = 1.3 * here + 0.3 * rise - around
+    peak = (here > levels.log[:, first : last - 2]) & (here >= levels.log[:, first + 2 : last])
+    score = np.where(peak, score, np.float32(-np.inf))
+    keep = min(CANDIDATES, score.shape[1])
+    top = np.argpartition(score, score.shape[1] - keep, axis=1)[:, -keep:]
+    heights = np.take_along_axis(score, top, axis=1)
+    order = np.argsort(-heights, axis=1)
+    top, heights = np.take_along_axis(top, order, axis=1), np.take_along_axis(heights, order, axis=1)
+    samples = np.where(np.isfinite(heights), top + first + 1, -1)
+    return np.pad(samples, ((0, 0), (0, CANDIDATES - keep)), constant_values=-1)
+
+
+def find_candidates(
+    envelopes: Envelopes, levels: Levels, noise: Array, skin_s: Array, window_s: tuple[float, float], transducer_hz: float
+) -> Candidates:
+    """The most salient echoes within `window_s` (least, most) behind the skin echo of each line.
 
     The search runs over the window common to all lines of the batch (the skin moves by a few samples only).
     """
     magnitude = np.abs(envelopes.values)
     rate = envelopes.rate_hz
-    noise = noise_level(magnitude)
-    time = np.arange(magnitude.shape[1]) / rate - float(np.median(skin_s))
-    weights = (10 ** (gain_db_per_s * np.clip(time, 0, most_s) / 20)).astype(np.float32)
-    first = max(int((np.median(skin_s) + least_s) * rate), 0)
-    last = min(int((np.median(skin_s) + most_s) * rate) + 1, magnitude.shape[1])
-    if last - first < 4:
-        empty = np.full((len(magnitude), 1), np.nan)
-        return Candidates(empty, empty, np.full(empty.shape, -1), noise)
-    samples = find_peaks(magnitude, weights, first, last)
-    positions, heights = refine_peaks(magnitude, samples)
-    return Candidates(positions / rate - skin_s[:, None], heights, samples, noise)
+    skin = float(np.median(skin_s))
+    first = max(int((skin + window_s[0]) * rate), 0)
+    last = min(int((skin + window_s[1]) * rate) + 1, magnitude.shape[1])
+    if last - first < 6:
+        return _none(len(magnitude), noise)
+    rise = TYPICAL_ATTENUATION * transducer_hz * 1e-6 * 154e3  # dB a second of delay: 77 km/s of depth, both ways, per cm
+    samples = salient_peaks(levels, rate, rise, first, last)
+    positions, heights, widths = _fit_tops(magnitude, samples)
+    complex_values = np.take_along_axis(envelopes.values, np.clip(samples, 0, None), axis=1)
+    # the baseband phase hardly changes within a sample; the carrier's phase is that of the refined time
+    phases = np.angle(complex_values) + 2 * np.pi * envelopes.carrier_hz * (positions / rate)
+    guard, near, reach = (int(x * rate) for x in (GUARD_CYCLES / transducer_hz, NEAR_S, SALIENCE_S))
+    skin_sample = np.full_like(samples, int(skin * rate) + guard)
+    end = np.full_like(samples, magnitude.shape[1])
+    base = np.log(noise)[:, None] + LOG_RAYLEIGH
+    around = levels.mean(samples - reach, samples + reach + 1)
+    start_near = np.maximum(samples - guard - near, skin_sample)
+    db = [
+        DECIBEL * (np.log(heights) - around),
+        DECIBEL * (levels.mean(start_near, samples - guard) - base),
+        DECIBEL * (levels.mean(samples + guard, samples + guard + near) - base),
+        DECIBEL * (levels.mean(skin_sample, samples - guard) - base),
+        DECIBEL * (levels.mean(samples + guard, end) - base),
+    ]
+    return Candidates(positions / rate - skin_s[:, None], heights, phases, widths / rate, *db, noise)
+
+
+def _none(count: int, noise: Array) -> Candidates:
+    empty = np.full((count, CANDIDATES), np.nan)
+    return Candidates(*[empty] * 9, noise)
+
+
+def concatenate(parts: list[Candidates]) -> Candidates:
+    """The candidates of several batches as one."""
+    names = Candidates.__dataclass_fields__
+    return Candidates(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})

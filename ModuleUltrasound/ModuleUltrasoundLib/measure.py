@@ -11,12 +11,12 @@ from CranioNavLib.parameters import Limits, Parameters
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Recording
 
-from ModuleUltrasoundLib.echo_candidates import Candidates, find_candidates
-from ModuleUltrasoundLib.forerun import Forerun, find_forerun, nominal_skin_s
+from ModuleUltrasoundLib.echo_likelihood import Network, probabilities, shared_features
+from ModuleUltrasoundLib.echo_search import Found, search_lines
 from ModuleUltrasoundLib.measure_points import bone_points as bone_points
-from ModuleUltrasoundLib.signal_chain import check_acquisition, complex_envelopes, design_band
 
-CHUNK = 256  # lines worked on at once: the working set stays in the processor's cache
+SAME_SPOT_MM = 5.0
+GAP_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class EchoSettings(Parameters):
     speed_of_sound_sd_m_s: Annotated[float, Limits(0, 200), "speed of sound in the tissue: SD of the prior"] = 52.0
     least_depth_mm: Annotated[float, Limits(0, 20), "no bone is looked for above this depth"] = 1.0
     most_depth_mm: Annotated[float, Limits(2, 60), "no bone is looked for below this depth"] = 20.0
-    quality_gate: Annotated[float, Limits(0, 1), "frames below this quality are not points"] = 0.8
+    quality_gate: Annotated[float, Limits(0, 1), "frames below this quality are not points"] = 0.85
     beam_width_mm: Annotated[float, Limits(0, 10), "-6 dB width of the beam"] = 1.2
     tilt_sd_deg: Annotated[float, Limits(0, 20), "SD of the angle between beam and bone normal"] = 2.0
 
@@ -55,6 +55,18 @@ class LineMeasurements:
         return len(self.depths_mm)
 
 
+def runs_and_spots(recording: Recording) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], bool]:
+    """Runs of frames that may support each other, spots on the head, and whether there are several spots."""
+    count = len(recording)
+    origins = recording.probe_to_reference[:, :3, 3]
+    jump = np.zeros(count, dtype=bool)
+    if count > 1:
+        step = np.linalg.norm(np.diff(origins, axis=0), axis=1)
+        jump[1:] = (np.nan_to_num(step) > SAME_SPOT_MM) | (np.diff(recording.palpation_points) != 0)
+    runs = np.cumsum(jump)
+    return runs, runs, bool(len(np.unique(runs)) >= 3)
+
+
 def measure_lines(recording: Recording, settings: EchoSettings | None = None) -> LineMeasurements:
     """Depth, bone point, covariance and quality of every frame of a recording.
 
@@ -64,33 +76,35 @@ def measure_lines(recording: Recording, settings: EchoSettings | None = None) ->
         The recording's header cannot be that of pulse-echo lines.
     """
     settings = settings or EchoSettings()
-    check_acquisition(recording.acquisition)
-    speed = settings.speed_of_sound_m_s
-    skin = nominal_skin_s(recording.acquisition)
-    until = skin * 1.06 + 2e-3 * (settings.most_depth_mm * 1.35) / speed + 3e-6
-    band = design_band(recording.acquisition, recording.lines.shape[1], until)
-    parts: list[tuple[Forerun, Candidates]] = []
-    per_s = 500.0 * speed  # mm of depth a second of delay
-    gain = 1.0 * recording.acquisition.transducer_hz * 1e-6 * 0.2 * per_s  # dB/cm/MHz, both ways
-    for start in range(0, len(recording), CHUNK):
-        envelopes = complex_envelopes(recording.lines[start : start + CHUNK], band)
-        forerun = find_forerun(envelopes, recording.acquisition)
-        least, most = settings.least_depth_mm / per_s, settings.most_depth_mm / per_s
-        parts.append((forerun, find_candidates(envelopes, forerun.skin_s, least, most, gain)))
-    delays = np.concatenate([found.delays_s for _, found in parts])
-    snr = np.concatenate([found.amplitudes / found.noise[:, None] for _, found in parts])
-    skins = np.concatenate([forerun.skin_s for forerun, _ in parts])
-    quality = np.nan_to_num(1 / (1 + np.exp(-(snr[:, 0] - 9.0))))
-    depths = delays * per_s
-    return assemble(recording, settings, depths, quality, skins, 0.3 / np.maximum(snr[:, 0], 1))
+    runs, spots, several = runs_and_spots(recording)
+    window = (settings.least_depth_mm, settings.most_depth_mm)
+    found = search_lines(recording, settings.speed_of_sound_m_s, window, several)
+    chance = bone_probabilities(found, runs, spots)
+    return assemble(recording, settings, found, chance)
 
 
-def assemble(
-    recording: Recording, settings: EchoSettings, depths: Array, quality: Array, skins: Array, sds: Array
-) -> LineMeasurements:
-    """The measurements of lines whose best echo stands first in `depths` (F, K)."""
-    depth = depths[:, 0]
-    ok = np.array([status == "OK" for status in recording.statuses]) & np.isfinite(recording.probe_to_reference).all(axis=(1, 2))
+def bone_probabilities(found: Found, runs: Array, spots: Array) -> Array:
+    """Probability (n, K) that each candidate is the bone: first from its line alone, then from the whole recording."""
+    from ModuleUltrasoundLib import echo_weights
+
+    single, both = Network.from_table(echo_weights.SINGLE), Network.from_table(echo_weights.SHARED)
+    scores = single.scores(found.features)
+    shared = shared_features(found.candidates, found.forerun_phases, scores, found.depths_mm, runs, spots)
+    scores = both.scores(np.concatenate([found.features, shared], axis=-1))
+    return probabilities(scores, np.isfinite(found.depths_mm))[0]
+
+
+def assemble(recording: Recording, settings: EchoSettings, found: Found, chance: Array) -> LineMeasurements:
+    """The measurements of a recording whose echoes have been judged."""
+    rows = np.arange(len(chance))
+    best = chance.argmax(axis=1)
+    depth = found.depths_mm[rows, best]
+    same = np.abs(found.depths_mm - depth[:, None]) < 0.5
+    quality = np.where(np.isfinite(depth), np.where(same, chance, 0.0).sum(axis=1), 0.0)
+    snr = 10 ** (found.candidates.snrs_db[rows, best] / 20)
+    sds = np.where(np.isfinite(snr), 0.3 / np.maximum(np.nan_to_num(snr, nan=1.0), 1.0), np.nan)
+    ok = np.array([status == "OK" for status in recording.statuses], dtype=bool)
+    ok &= np.isfinite(recording.probe_to_reference).all(axis=(1, 2))
     reasons = []
     for index in range(len(depth)):
         status = recording.statuses[index]
@@ -105,9 +119,9 @@ def assemble(
     # the Probe frame starts at the transducer's face: the skin lies one forerun further on
     position = origin + beam * (recording.acquisition.forerun_length_mm + depth)[:, None]
     across = (settings.beam_width_mm / 2.3548) ** 2
-    along = sds**2
     outer = beam[:, :, None] * beam[:, None, :]
-    covariance = along[:, None, None] * outer + across * (np.eye(3) - outer)
+    covariance = (sds**2)[:, None, None] * outer + across * (np.eye(3) - outer)
+    others = np.where(same | (chance < 0.01), np.nan, found.depths_mm)
     return LineMeasurements(
         depths_mm=depth,
         depth_sds_mm=sds,
@@ -117,9 +131,9 @@ def assemble(
         qualities=quality,
         accepted=np.array([reason == "" for reason in reasons], dtype=bool),
         reasons=tuple(reasons),
-        alternative_depths_mm=np.empty((len(depth), 0)),
-        alternative_probabilities=np.empty((len(depth), 0)),
-        skin_times_s=skins,
+        alternative_depths_mm=others,
+        alternative_probabilities=np.where(np.isfinite(others), chance, np.nan),
+        skin_times_s=found.forerun.skin_s,
         speed_of_sound_m_s=settings.speed_of_sound_m_s,
         speed_of_sound_sd_m_s=settings.speed_of_sound_sd_m_s,
     )

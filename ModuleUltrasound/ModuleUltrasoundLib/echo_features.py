@@ -1,0 +1,91 @@
+"""What the physics of a bone echo says about each candidate, as numbers of order one.
+
+Bone under soft tissue is the first strong specular interface, and it casts a shadow: the tissue's own echoes end with it.
+Behind it come the inner table and reverberations, before it weaker interfaces (galea, fat and muscle). The forerun's
+echoes repeat at whole multiples of its time. The electronic noise is the same everywhere.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from CranioNavLib.rigid import Array
+
+from ModuleUltrasoundLib.echo_candidates import DECIBEL, Candidates
+from ModuleUltrasoundLib.signal_forerun import MULTIPLES, Forerun
+
+FAR_MM = 12.0  # stands for "there is none" in distances between echoes
+FAR_DB = 40.0
+MULTIPLE_TOLERANCE_S = 3.5e-7  # a multiple carries the pulse's delay once, its prediction twice
+REVERBERATION_TOLERANCE_S = 2.5e-7
+
+NAMES = (
+    "snr", "salience", "before", "after", "before all", "after all", "drop", "drop all", "stronger before", "its distance",
+    "stronger behind", "its distance behind", "depth", "loss", "multiple", "multiple share", "forerun", "has forerun",
+    "reverberation", "width", "rank before", "rank behind", "line snr", "next best",
+)  # fmt: skip
+
+
+def line_features(candidates: Candidates, forerun: Forerun, nominal_skin_s: float, transducer_hz: float, speed_m_s: float) -> Array:
+    """Features (n, K, len(NAMES)) of each candidate from its own line alone; NaN candidates give finite numbers."""
+    snr = candidates.snrs_db
+    valid = np.isfinite(snr)
+    depth = np.where(valid, candidates.delays_s * 500 * speed_m_s, 0.0)
+    snr = np.where(valid, snr, -FAR_DB)
+    pair = snr[:, None, :] - snr[:, :, None]  # [line, one, other]: how much stronger the other is
+    gap = depth[:, None, :] - depth[:, :, None]
+    both = valid[:, None, :] & valid[:, :, None]
+    before, behind = both & (gap < -0.3), both & (gap > 0.3)
+    best_before, far_before = _strongest(pair, gap, before)
+    best_behind, far_behind = _strongest(pair, gap, behind)
+    multiple, share = _multiples(candidates, forerun, nominal_skin_s, valid)
+    reverberation = _reverberations(candidates, pair, before)
+    seen = forerun.amplitude[:, None] > 0
+    over_forerun = np.where(
+        seen, DECIBEL * np.log(np.maximum(candidates.amplitudes, 1e-9) / np.maximum(forerun.amplitude[:, None], 1e-9)), 0.0
+    )
+    megahertz = transducer_hz * 1e-6
+    levels = [np.clip(np.nan_to_num(x, nan=0.0), -5, 60) for x in (candidates.before_db, candidates.after_db)]
+    levels_all = [np.clip(np.nan_to_num(x, nan=0.0), -5, 60) for x in (candidates.before_all_db, candidates.after_all_db)]
+    ordered = np.sort(snr, axis=1)
+    features = [
+        snr / 20, candidates.saliences_db / 10, levels[0] / 10, levels[1] / 10, levels_all[0] / 10, levels_all[1] / 10,
+        (levels[0] - levels[1]) / 10, (levels_all[0] - levels_all[1]) / 10, best_before / 15, far_before / 5,
+        best_behind / 15, far_behind / 5, depth / 8, depth * megahertz / 50, multiple, share / 15, over_forerun / 30,
+        np.broadcast_to(seen, snr.shape).astype(float), reverberation / 15, candidates.widths_s * transducer_hz,
+        (before & (pair > -8)).sum(axis=2) / 3.0, (behind & (pair > -8)).sum(axis=2) / 3.0,
+        np.broadcast_to(ordered[:, -1:], snr.shape) / 20, (ordered[:, -1:] - snr) / 15,
+    ]  # fmt: skip
+    stacked = np.stack([np.where(valid, feature, 0.0) for feature in features], axis=-1)
+    return np.clip(np.nan_to_num(stacked), -4, 4)
+
+
+def _strongest(pair: Array, gap: Array, where: Array) -> tuple[Array, Array]:
+    """How much stronger (dB) the strongest echo of those `where` is, and how far (mm) away it lies."""
+    masked = np.where(where, pair, -FAR_DB)
+    which = masked.argmax(axis=2)[..., None]
+    best = np.take_along_axis(masked, which, axis=2)[..., 0]
+    far = np.abs(np.take_along_axis(gap, which, axis=2)[..., 0])
+    return np.clip(best, -FAR_DB, FAR_DB), np.where(where.any(axis=2), np.minimum(far, FAR_MM), FAR_MM)
+
+
+def _multiples(candidates: Candidates, forerun: Forerun, nominal_skin_s: float, valid: Array) -> tuple[Array, Array]:
+    """Whether a candidate lies where the forerun's echo repeats, and its strength over the forerun's echo there (dB)."""
+    place = np.zeros(valid.shape)
+    share = np.zeros(valid.shape)
+    if nominal_skin_s <= 0:
+        return place, share
+    for number in range(2, MULTIPLES + 1):
+        off = np.abs(candidates.delays_s - (number - 1) * forerun.skin_s[:, None]) / MULTIPLE_TOLERANCE_S
+        place = np.maximum(place, np.where(valid, np.exp(-(np.nan_to_num(off, nan=9.0) ** 2)), 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        over = DECIBEL * np.log(candidates.amplitudes / forerun.amplitude[:, None])
+    share = np.where(valid & np.isfinite(over), over, 0.0) * place
+    return place, share
+
+
+def _reverberations(candidates: Candidates, pair: Array, before: Array) -> Array:
+    """How much stronger (dB) an earlier echo is of which this one would be the first reverberation under the skin."""
+    delays = np.nan_to_num(candidates.delays_s)
+    off = np.abs(delays[:, :, None] - 2 * delays[:, None, :])
+    hit = before & (off < REVERBERATION_TOLERANCE_S)
+    return np.asarray(np.where(hit, np.clip(pair, 0, FAR_DB), 0.0).max(axis=2))

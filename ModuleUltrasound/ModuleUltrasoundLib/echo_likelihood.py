@@ -1,0 +1,148 @@
+"""Which echo is the bone: probabilities of all candidates of a line, and of none of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from CranioNavLib.rigid import Array
+
+from ModuleUltrasoundLib.echo_candidates import DECIBEL, Candidates
+
+SAME_MM = 0.35  # candidates of neighbouring lines nearer than this support each other
+REACH = 2  # neighbouring lines on each side
+LEAST_FOR_SHARED = 3  # lines with a likely bone before anything is learnt from the recording
+
+
+Table = tuple[tuple[tuple[tuple[float, ...], ...], tuple[float, ...]], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """A small perceptron that turns a candidate's features into its log-odds against "no bone"."""
+
+    layers: tuple[tuple[Array, Array], ...]  # weights (in, out) and biases (out,)
+
+    @classmethod
+    def from_table(cls, table: Table) -> Network:
+        """The network whose numbers stand in a table (see echo_weights.py)."""
+        return cls(tuple((np.array(weights, dtype=float), np.array(biases, dtype=float)) for weights, biases in table))
+
+    def scores(self, features: Array) -> Array:
+        """Log-odds (n, K) of features (n, K, D)."""
+        x = features
+        for weights, biases in self.layers[:-1]:
+            x = np.tanh(x @ weights + biases)
+        weights, biases = self.layers[-1]
+        return np.asarray((x @ weights + biases)[..., 0])
+
+
+def probabilities(scores: Array, valid: Array) -> tuple[Array, Array]:
+    """Softmax over the candidates and "none": probability of each candidate (n, K), and of none (n,)."""
+    scores = np.where(valid, scores, -np.inf)
+    top = np.maximum(scores.max(axis=1, initial=0.0), 0.0)[:, None]
+    weight = np.exp(scores - top)
+    none = np.exp(-top)
+    total = weight.sum(axis=1, keepdims=True) + none
+    return weight / total, (none / total)[:, 0]
+
+
+SHARED_NAMES = ("single", "strength", "strength known", "polarity", "polarity known", "support", "has neighbours", "static")
+
+
+def shared_features(candidates: Candidates, forerun_phase: Array, scores: Array, depth_mm: Array, runs: Array, spots: Array) -> Array:
+    """Features (n, K, len(SHARED_NAMES)) of each candidate from all lines of the recording.
+
+    `runs` (n,) numbers stretches of consecutive frames that may support each other, `spots` (n,) places on the head.
+    """
+    valid = np.isfinite(depth_mm)
+    chance, _ = probabilities(scores, valid)
+    strength, strength_known = relative_strength(candidates, chance, depth_mm)
+    polarity, polarity_known = relative_polarity(candidates.phases - forerun_phase[:, None], chance)
+    support, neighbours = neighbour_support(chance, depth_mm, runs)
+    features = [
+        np.clip(scores, -8, 8) / 4,
+        strength,
+        np.full(scores.shape, strength_known),
+        polarity,
+        np.full(scores.shape, polarity_known),
+        support,
+        np.broadcast_to(neighbours[:, None], scores.shape),
+        static_share(depth_mm, spots),
+    ]
+    return np.nan_to_num(np.stack([np.where(valid, feature, 0.0) for feature in features], axis=-1))
+
+
+def relative_strength(candidates: Candidates, chance: Array, depth_mm: Array) -> tuple[Array, float]:
+    """Level of each candidate over what a bone of its depth shows in this recording, in units of 15 dB.
+
+    The bone's level falls with depth by the tissue's attenuation: a straight line through the likely bones of all lines,
+    its slope shrunk to the middle of what tissue has.
+    """
+    level = DECIBEL * np.log(np.maximum(candidates.amplitudes, 1e-9))
+    best = chance.argmax(axis=1)
+    rows = np.arange(len(chance))
+    weight = np.where(chance[rows, best] > 0.5, chance[rows, best], 0.0)
+    if (weight > 0).sum() < LEAST_FOR_SHARED:
+        return np.zeros(level.shape), 0.0
+    y, x = np.nan_to_num(level[rows, best]), np.nan_to_num(depth_mm[rows, best])
+    slope, middle_x, middle_y = 0.0, 0.0, 0.0
+    for _ in range(3):
+        total = weight.sum() + 1e-9
+        middle_x, middle_y = float((weight * x).sum() / total), float((weight * y).sum() / total)
+        spread = (weight * (x - middle_x) ** 2).sum()
+        slope = float(np.clip((weight * (x - middle_x) * (y - middle_y)).sum() / (spread + 30.0), -5.0, 0.0))
+        off = y - middle_y - slope * (x - middle_x)
+        # tilted lines are weak: the upper part counts, so weak ones lose weight faster
+        weight = np.where(chance[rows, best] > 0.5, chance[rows, best], 0.0) / (1 + (np.where(off < 0, off / 6, off / 12)) ** 2)
+    expected = middle_y + slope * (depth_mm - middle_x)
+    known = float(min(weight.sum() / 10, 1.0))
+    return np.clip((level - expected) / 15, -3, 3) * known, known
+
+
+def relative_polarity(phases: Array, chance: Array) -> tuple[Array, float]:
+    """Cosine of each candidate's phase against the bone echoes' common phase, faded if they share none."""
+    best = chance.argmax(axis=1)
+    rows = np.arange(len(chance))
+    weight = np.where(chance[rows, best] > 0.5, chance[rows, best], 0.0)
+    if (weight > 0).sum() < LEAST_FOR_SHARED:
+        return np.zeros(phases.shape), 0.0
+    mean = (weight * np.exp(1j * np.nan_to_num(phases[rows, best]))).sum() / weight.sum()
+    length = float(np.abs(mean))
+    known = max(0.0, (length - 0.3) / 0.7) * float(min(weight.sum() / 10, 1.0))
+    return np.cos(phases - np.angle(mean)) * known, known
+
+
+def neighbour_support(chance: Array, depth_mm: Array, runs: Array) -> tuple[Array, Array]:
+    """Mean chance (n, K) that the neighbouring lines give to the same depth, and whether a line has neighbours (n,)."""
+    count = len(chance)
+    support = np.zeros(chance.shape)
+    number = np.zeros(count)
+    depth = np.nan_to_num(depth_mm, nan=-99.0)
+    for step in [*range(-REACH, 0), *range(1, REACH + 1)]:
+        other = np.arange(count) + step
+        ok = (other >= 0) & (other < count)
+        other = np.clip(other, 0, count - 1)
+        ok &= runs[other] == runs
+        near = np.exp(-0.5 * ((depth[:, :, None] - depth[other][:, None, :]) / SAME_MM) ** 2)
+        support += np.where(ok[:, None], (near * chance[other][:, None, :]).sum(axis=2), 0.0)
+        number += ok
+    return support / np.maximum(number, 1)[:, None], (number > 0).astype(float)
+
+
+def static_share(depth_mm: Array, spots: Array) -> Array:
+    """Share of the other places on the head that show an echo at this very depth: an artefact does, bone does not."""
+    bins = np.nan_to_num(np.floor(depth_mm / 0.2), nan=-1).astype(np.int64)
+    top = max(int(bins.max(initial=0)) + 2, 2)
+    _, place = np.unique(spots, return_inverse=True)
+    places = int(place.max(initial=0)) + 1
+    if places < 4:
+        return np.zeros(depth_mm.shape)
+    shown = np.zeros((places, top + 1), dtype=bool)
+    shown[np.repeat(place, bins.shape[1]), np.where(bins < 0, top, bins).ravel()] = True
+    shown[:, top] = False
+    wide = shown.copy()
+    wide[:, 1:] |= shown[:, :-1]
+    wide[:, :-1] |= shown[:, 1:]
+    share = (wide.sum(axis=0) - 1) / (places - 1)
+    return np.asarray(np.where(bins >= 0, share[np.clip(bins, 0, top)], 0.0) * min((places - 3) / 8, 1.0))
