@@ -1,6 +1,17 @@
 """The virtual patient: a real or synthetic head, its tissue and markers, a simulated tracker and A-mode probe."""
 
+from CranioNavLib.phantom.case_writer import MODES, write_case, write_volume
+from CranioNavLib.phantom.palpation import Palpation, palpate
 from CranioNavLib.phantom.patient import VirtualPatient, make_patient
 from CranioNavLib.phantom.sites import LANDMARK_LABELS
 
-__all__ = ["LANDMARK_LABELS", "VirtualPatient", "make_patient"]
+__all__ = [
+    "LANDMARK_LABELS",
+    "MODES",
+    "Palpation",
+    "VirtualPatient",
+    "make_patient",
+    "palpate",
+    "write_case",
+    "write_volume",
+]

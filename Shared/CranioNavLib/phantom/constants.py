@@ -82,7 +82,8 @@ SITE_CORRELATION_MM = 25.0  # [M] over which layers, coupling and site speed cha
 # Specular part 2 J1(x) / x with x = k D sin(angle) [C, disc before a plane reflector]; over it a wide diffuse part.
 DIFFUSE_FLOOR_DB = (-32.0, -24.0)  # [M] -25 to -35 dB below the normal echo; one draw a patient
 DIFFUSE_WIDTH_DEG = 35.0  # [M] half width (SD) of the diffuse lobe
-BONE_ROUGHNESS_MM = 0.03  # [S] Wilhjelm 1998 used 0-0.16 mm rms; outer table smooth [M]
+BONE_ROUGHNESS_MM = 0.02  # [S] Wilhjelm 1998 used 0-0.16 mm rms; outer table smooth [M]
+CT_STAIRCASE_MM = 0.04  # [C] roughness of the surface that is the CT's and not the bone's: 0.01-0.035 mm on the vault
 
 # --- Probe ----------------------------------------------------------------------------------------------------------
 TRANSDUCER_HZ = 5.0e6  # [S] chapter
@@ -103,7 +104,7 @@ LARGEST_GEL_GAP_MM = 0.6  # [M] more than this is air: no sound passes
 SAMPLING_HZ = 60.0e6  # [S] pic0rick: 60 Msps
 ADC_BITS = 10  # [S] pic0rick
 LINE_SAMPLES = 3072  # [C] 51 us: 23 mm of polystyrene and 24 mm of tissue
-FULL_SCALE_RANGE = (0.22, 0.45)  # [M] amplitude (transmitted pulse = 1) at which the converter saturates: the user's gain
+FULL_SCALE_RANGE = (0.10, 0.30)  # [M] amplitude (transmitted pulse = 1) at which the converter saturates: the user's gain
 ELECTRONIC_NOISE = 0.0012  # [M] RMS at the converter, in units of the transmitted pulse, 1-10 MHz
 TRANSMIT_BURST_US = 0.9  # [M] main bang and its ringing
 BAND_HZ = (1.0e6, 10.0e6)  # [M] receiver's pass band

@@ -187,7 +187,8 @@ def _bone(tissue: Tissue, seen: BeamOnBone, speed: Array, forerun_s: Array, coup
     depth = np.nan_to_num(seen.center_mm)
     met = np.isfinite(seen.center_mm)
     wave_number = 2 * np.pi * constants.TRANSDUCER_HZ / speed * 1e-3  # per mm
-    rough = np.hypot(np.nan_to_num(seen.roughness_mm), constants.BONE_ROUGHNESS_MM)
+    shape = np.maximum(np.nan_to_num(seen.roughness_mm) - constants.CT_STAIRCASE_MM, 0.0)
+    rough = np.hypot(shape, constants.BONE_ROUGHNESS_MM)
     smoothness = np.exp(-2 * (wave_number * np.minimum(rough, 0.3)) ** 2)  # coherent share of a rough mirror's echo
     mirror = reflection * passed * smoothness * met
     time = forerun_s + 2e-3 * depth / speed
