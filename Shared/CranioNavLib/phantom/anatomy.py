@@ -70,7 +70,8 @@ def head_region(volume: Volume) -> npt.NDArray[np.bool_]:
         padded = np.pad(section, radius + 1)
         sealed = ndimage.binary_fill_holes(ndimage.binary_closing(padded, disc))
         filled[index] = sealed[radius + 1 : -radius - 1, radius + 1 : -radius - 1]
-    return filled
+    region: npt.NDArray[np.bool_] = filled
+    return region
 
 
 def _grow(mask: npt.NDArray[np.bool_], voxels: int) -> npt.NDArray[np.bool_]:

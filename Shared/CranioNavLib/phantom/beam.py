@@ -70,8 +70,9 @@ def look_at_bone(bone: Surface, contact_to_ras: npt.ArrayLike) -> BeamOnBone:
 
 def _plane_fit(ranges: Array) -> tuple[Array, Array, Array]:
     """Weighted plane through each beam's footprint: range at the axis (F,), slopes (F, 2), roughness (F,)."""
-    valid = np.isfinite(ranges)
-    anchor = np.where(valid.any(axis=1), np.nanmedian(np.where(valid.any(axis=1)[:, None], ranges, 0.0), axis=1), np.nan)
+    valid: npt.NDArray[np.bool_] = np.asarray(np.isfinite(ranges))
+    some = np.asarray(valid.any(axis=1))
+    anchor = np.where(some, np.nanmedian(np.where(some[:, None], ranges, 0.0), axis=1), np.nan)
     with np.errstate(invalid="ignore"):
         valid &= np.abs(ranges - anchor[:, None]) < SAME_SURFACE_MM
     enough = (valid * BEAM_WEIGHTS).sum(axis=1) > 0.3

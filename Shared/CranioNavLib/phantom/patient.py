@@ -152,9 +152,8 @@ class _Keyed:
         import hashlib
 
         self.volume, self.landmarks = volume, landmarks
-        digest = hashlib.sha256(np.ascontiguousarray(volume.hu))
-        self.voxels = digest.hexdigest()
-        digest.update(np.ascontiguousarray(volume.ijk_to_ras, dtype=float))
+        digest = hashlib.sha256(volume.hu.tobytes())
+        digest.update(volume.ijk_to_ras.astype(float).tobytes())
         digest.update(b"" if landmarks is None else landmarks.tobytes())
         self.key = digest.hexdigest()
 
@@ -191,7 +190,7 @@ def _known_landmarks(volume: Volume) -> Array:
     import hashlib
 
     if volume.hu.shape == SAMPLE_SHAPE:
-        raw = np.ascontiguousarray(volume.hu[:, ::-1, :].astype("<i2"))
-        if hashlib.sha256(raw).hexdigest() == SAMPLE_SHA256:
+        raw = volume.hu[:, ::-1, :].astype("<i2")
+        if hashlib.sha256(raw.tobytes()).hexdigest() == SAMPLE_SHA256:
             return np.array(SAMPLE_HEAD_LANDMARKS_MM)
     raise InputError("the landmarks of this CT are not known; give four in RAS: " + ", ".join(LANDMARK_LABELS))

@@ -46,13 +46,13 @@ def outer_seats(bone: Surface, skin: Surface, rng: np.random.Generator) -> tuple
     Rays from all sides towards the head's middle; where the bone is smooth, faces outwards and is covered by thin scalp.
     """
     middle = skin.center_mm
-    directions = rng.normal(size=(CANDIDATES, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    drawn = rng.normal(size=(CANDIDATES, 3))
+    directions: Array = drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
     origins = middle + 300.0 * directions
     hits = bone.cast(origins, -directions)
     found = np.isfinite(hits.distances_mm)
-    points = origins[found] - directions[found] * hits.distances_mm[found, None]
     directions = directions[found]
+    points: Array = origins[found] - directions * hits.distances_mm[found, None]
     normals, spread = _smooth_normals(bone, points, directions)
     to_skin = skin.cast(points + 0.1 * normals, normals).distances_mm
     top, bottom = skin.vertices_mm[:, 2].max(), skin.vertices_mm[:, 2].min()
