@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Generic, TypeVar
 
 from CranioNavLib import scene
+from CranioNavLib.panel import Panel
 from CranioNavLib.panel_model import settings_prefix
 from CranioNavLib.parameter_node import ParameterNode
 from CranioNavLib.parameters import Parameters
@@ -31,3 +32,16 @@ class ParametersInScene(Generic[P]):
         """A plugin of a kind with the settings that the scene keeps for it."""
         plugin = KINDS[kind].find(name)
         return plugin(ParameterNode(self.parameters().node, plugin.Settings, settings_prefix(kind, name)).read())
+
+
+def describeModule(parent: Any, title: str, panel: Panel, dependencies: list[str]) -> None:
+    """Fill in what 3D Slicer's module list says of a module; the help text comes from its panel."""
+    parent.title = title
+    parent.categories = ["IGT.CranioNav"]
+    parent.dependencies = dependencies
+    parent.contributors = ["The CranioNav developers"]
+    steps = "".join(f"<li><b>{step.title}</b>: {step.help}</li>" for step in panel.steps)
+    parent.helpText = f"<p>{panel.title}, step by step:</p><ol>{steps}</ol><p>Not a medical device.</p>"
+    parent.acknowledgementText = (
+        "After Popovic, Heger et al., Efficient Non-Invasive Registration with A-mode Ultrasound in Skull Surgery."
+    )

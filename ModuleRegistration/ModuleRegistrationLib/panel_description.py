@@ -1,0 +1,118 @@
+"""The registration panel and its parameters, as data: drawn by Qt inside 3D Slicer and in the browser."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from CranioNavLib.panel import Action, FileField, NodeField, Panel, ParameterField, PluginField, ReadOut, Step
+from CranioNavLib.parameters import Limits, Parameters
+
+from ModuleRegistrationLib.anatomy.segmentation import SEGMENTATIONS
+from ModuleRegistrationLib.registration.problem import METHODS
+
+CT_FILES = ("CT (*.nrrd *.nii *.nii.gz *.mha *.mhd *.dcm)", "All files (*)")
+
+
+@dataclass(frozen=True)
+class RegistrationParameters(Parameters):
+    """What the registration module keeps in the scene."""
+
+    case_folder: Annotated[str, "folder with CT, landmark lists and recording of one registration"] = ""
+    ct_path: Annotated[str, "DICOM folder or image file of the head"] = ""
+    ct_series: Annotated[str, "number, description or UID of the series, where a folder holds several"] = ""
+    segmentation: Annotated[str, "how bone is found in the CT"] = "threshold"
+    marker_diameter_mm: Annotated[float, Limits(1, 20), "diameter of the titanium spheres"] = 4.0
+    # The chapter's mode IIa: a TRE of 2.78 mm with four anatomical landmarks needs about this much per landmark.
+    landmark_fle_mm: Annotated[float, Limits(0.05, 20), "usual error of one landmark pair (RMS, 3-D)"] = 3.5
+    palpated_sd_mm: Annotated[float, Limits(0.05, 5), "error of a point touched with the stylus, per axis"] = 0.5
+    method: Annotated[str, "how bone points are laid on the surface"] = "cranionav"
+    output_folder: Annotated[str, "where results are written"] = ""
+
+
+PANEL = Panel(
+    module="ModuleRegistration",
+    title="Registration",
+    parameters=RegistrationParameters,
+    steps=(
+        Step(
+            name="ct",
+            title="CT",
+            help="Load the head CT, or a whole case folder with its landmarks and recording.",
+            items=(
+                FileField("ct_path", "CT", CT_FILES),
+                ParameterField("ct_series", "Series"),
+                Action("loadCt", "Load CT", "Read the CT into the scene", primary=True),
+                FileField("case_folder", "Case folder", folder=True),
+                Action("loadCase", "Load case", "Read CT, landmarks, recording and targets of a case folder"),
+                NodeField("CT", "CT in use", "Another volume of the scene may be chosen"),
+            ),
+            status="ctStatus",
+        ),
+        Step(
+            name="bone",
+            title="Bone and markers",
+            help="Find the skull's outer table, and titanium spheres if the patient carries any.",
+            items=(
+                PluginField("segmentation", "Method", SEGMENTATIONS.kind),
+                Action("segmentBone", "Find bone", "Segment the skull; takes some seconds", primary=True),
+                NodeField("OuterTable", "Outer table"),
+                ParameterField("marker_diameter_mm"),
+                Action("findMarkers", "Find spheres", "Centres of titanium spheres become the target points of the CT"),
+            ),
+            status="boneStatus",
+        ),
+        Step(
+            name="landmarks",
+            title="Landmarks",
+            help="Pair at least three landmarks of the CT with the same landmarks touched on the patient.",
+            items=(
+                NodeField("LandmarksCT", "In the CT"),
+                NodeField("LandmarksPatient", "On the patient"),
+                ParameterField("landmark_fle_mm"),
+                Action("registerLandmarks", "Register landmarks", "First estimate of ReferenceToRas", primary=True),
+                ReadOut("fre", "FRE (RMS, not an accuracy)", "mm"),
+            ),
+            status="landmarkStatus",
+        ),
+        Step(
+            name="surface",
+            title="Surface",
+            help="Lay the bone points measured by ultrasound or stylus on the skull.",
+            items=(
+                NodeField("SurfacePoints", "Bone points"),
+                ParameterField("palpated_sd_mm"),
+                PluginField("method", "Method", METHODS.kind),
+                Action("registerSurface", "Register surface", "Refine ReferenceToRas and judge it", primary=True),
+                ReadOut("verdict", "Verdict", large=True),
+                ReadOut("predictedTre", "Predicted TRE (mean; 95% at the worst target)", "mm", large=True),
+                ReadOut("surfaceResidual", "Surface residual (RMS, not an accuracy)", "mm"),
+                ReadOut("speedOfSound", "Speed of sound", "m/s"),
+            ),
+            status="surfaceStatus",
+        ),
+        Step(
+            name="verification",
+            title="Verification",
+            help="Compare with markers and bone points that the registration has not used.",
+            items=(
+                NodeField("TargetsCT", "Targets in the CT"),
+                NodeField("TargetsPatient", "Targets on the patient"),
+                NodeField("PlausibilityPoints", "Plausibility points"),
+                Action("verify", "Verify", "Measured TRE at the targets, distance of the plausibility points", primary=True),
+                ReadOut("measuredTre", "Measured TRE (mean ± SD; largest)", "mm", large=True),
+                ReadOut("plausibility", "Plausibility (largest surface distance)", "mm"),
+            ),
+            status="verificationStatus",
+        ),
+        Step(
+            name="results",
+            title="Results",
+            help="ReferenceToRas.tfm and scene.mrb, for 3D Slicer and other programs.",
+            items=(
+                FileField("output_folder", "Folder", folder=True),
+                Action("saveResults", "Save", "Write the transform and the scene", primary=True),
+            ),
+        ),
+    ),
+)
