@@ -248,9 +248,9 @@ def probe_footprint(surface: Surface, positions_mm: Array, outward: Array) -> tu
 def _tangents(axis: Array) -> tuple[Array, Array]:
     """Two unit vectors (M, 3) each, square to `axis` (M, 3) and to each other."""
     helper = np.where(np.abs(axis[:, 2:]) < 0.9, np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 0.0]]))
-    across = np.cross(helper, axis)
+    across: Array = np.asarray(np.cross(helper, axis), dtype=float)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    return across, np.cross(axis, across)
+    return across, np.asarray(np.cross(axis, across), dtype=float)
 
 
 def _heights_under_probe(surface: Surface, positions: Array, axis: Array) -> tuple[Array, Array]:
@@ -270,9 +270,10 @@ def _fit_planes(offsets: Array, heights: Array) -> tuple[Array, Array]:
     """Slopes (M, 2) and RMS residual (M,) of planes fitted to heights (M, R) at offsets (R, 2)."""
     design = np.column_stack([offsets, np.ones(len(offsets))])
     solution = heights @ np.linalg.pinv(design).T
-    residuals = heights - solution @ design.T
+    residuals: Array = heights - solution @ design.T
+    slopes: Array = solution[:, :2]
     roughness: Array = np.sqrt(np.mean(residuals**2, axis=1))
-    return solution[:, :2], roughness
+    return slopes, roughness
 
 
 def _information(spot: _Spot, center: Array) -> Array:

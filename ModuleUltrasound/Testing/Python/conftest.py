@@ -1,0 +1,18 @@
+"""Where the real A-mode recordings are, if this computer has them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture
+def amode_recordings() -> Path:
+    """Folder with the recordings of open-hardware boards; they may not be kept in this repository."""
+    named = os.environ.get("CRANIONAV_AMODE_DATA")
+    folder = Path(named) if named else Path(__file__).resolve().parents[4] / "shared" / "data" / "amode"
+    if not (folder / "pic0rick-water-steel-steps.npz").is_file():
+        pytest.skip(f"no recordings in {folder}; set CRANIONAV_AMODE_DATA to the folder with pic0rick-water-steel-steps.npz")
+    return folder
