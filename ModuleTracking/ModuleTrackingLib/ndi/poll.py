@@ -1,0 +1,189 @@
+"""The tracking loop as a script: poll at the device's own pace, survive damaged replies, notice a loss."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ModuleTrackingLib.ndi.replies import BadReplyError, DeviceError
+from ModuleTrackingLib.ndi.session import Session
+from ModuleTrackingLib.ndi.steps import (
+    FENCE_COMMAND,
+    Answer,
+    Ask,
+    DamagedReplyError,
+    Hush,
+    Pause,
+    ReplyKind,
+    Script,
+    SilenceError,
+)
+from ModuleTrackingLib.ndi.tracking import REPORT_OUT_OF_VOLUME, TOOL_INFO, TRANSFORMS, TrackingReply, parse_bx
+from ModuleTrackingLib.ndi.tracking_text import parse_tx
+
+OPTIONS = TRANSFORMS | TOOL_INFO | REPORT_OUT_OF_VOLUME
+FAILURES_FOR_LOSS = 3
+LOST_AFTER_S = 0.5  # damaged replies for this long, and at least three of them
+WRAP = 2**32
+FENCE_S = 0.2
+NO_TOOL_S = 0.02  # pace of polling while every handle is disabled or unplugged
+BYTES_A_TOOL = {True: 53, False: 94}  # BX, TX, with tool information
+
+
+class FrameClock:
+    """Frame numbers as a count that never wraps, and the pace at which frames come."""
+
+    def __init__(self) -> None:
+        self.count = -1  # of the newest frame, unwrapped
+        self._steps: list[tuple[int, float]] = []  # recent frames: count, host time
+        self._lead = 0.05  # how much before the next frame is due the poll goes out, as a share of the period
+
+    def unwrap(self, frame: int) -> int:
+        """The count of a 32-bit frame number, the one nearest to the newest frame."""
+        if self.count < 0:
+            return frame
+        return self.count + (frame - self.count + WRAP // 2) % WRAP - WRAP // 2
+
+    def note(self, count: int, at_s: float, polls: int) -> None:
+        """A new frame came at `at_s` after so many polls."""
+        self.count = count
+        self._steps = [*self._steps[-40:], (count, at_s)]
+        change = -0.002 if polls > 1 else 0.002  # met at the first poll: go a little earlier
+        self._lead = min(0.3, max(0.0, self._lead + change))
+
+    @property
+    def period_s(self) -> float:
+        """Time from frame to frame as seen on this host; 0 while it is not known."""
+        if len(self._steps) < 8:
+            return 0.0
+        (first, since_s), (last, until_s) = self._steps[0], self._steps[-1]
+        step = min(b[0] - a[0] for a, b in zip(self._steps, self._steps[1:]))
+        return step * (until_s - since_s) / max(1, last - first)
+
+    def wait_s(self, now_s: float) -> float:
+        """How long to wait before the next poll after a new frame."""
+        if not self._steps or self.period_s == 0.0:
+            return 0.0
+        return max(0.0, self._steps[-1][1] + (1.0 - self._lead) * self.period_s - now_s)
+
+    def retry_s(self) -> float:
+        """How long to wait after a poll that brought nothing new."""
+        return max(0.0003, self.period_s / 25.0) if self.period_s else 0.0005
+
+
+@dataclass
+class Counts:
+    """What happened on the line since tracking began."""
+
+    polls: int = 0
+    frames: int = 0
+    repeats: int = 0
+    damaged: int = 0
+    silent: int = 0
+
+
+class Poller:
+    """Scripts that bring one new frame at a time.
+
+    Parameters
+    ----------
+    session : Session
+        Set up and tracking.
+    binary : bool
+        Ask for BX; where the device does not know it, TX takes over by itself.
+    now : callable
+        Monotonic seconds.
+    """
+
+    def __init__(self, session: Session, binary: bool, now: Callable[[], float]) -> None:
+        self.session, self.binary, self.now = session, binary, now
+        self.clock, self.counts = FrameClock(), Counts()
+        self.last_good_s = now()
+        self.trouble = ""  # what the line did since the last good reply, in words
+
+    def next_frame(self) -> Script[tuple[TrackingReply, float]]:
+        """The next new frame, and when its last byte was read.
+
+        Raises
+        ------
+        LinkError
+            Nothing trustworthy for too long, or the port is gone.
+        DeviceError
+            The device is not tracking any more.
+        """
+        polls = failures = 0
+        yield Pause(self.clock.wait_s(self.now()))
+        while True:
+            try:
+                reply, at_s = yield from self._poll()
+                self.last_good_s, self.trouble, failures = self.now(), "", 0
+                polls += 1
+                if self._has_no_frame(reply):
+                    yield Pause(NO_TOOL_S)
+                    return reply, at_s
+                if self._is_new(reply):
+                    self.clock.note(self._newest(reply), at_s, polls)
+                    self.counts.frames += 1
+                    return reply, at_s
+                self.counts.repeats += 1
+                yield Pause(self.clock.retry_s())
+            except (SilenceError, DamagedReplyError, BadReplyError) as error:
+                failures += 1
+                self.trouble = str(error)
+                if failures >= FAILURES_FOR_LOSS and self.now() - self.last_good_s > LOST_AFTER_S:
+                    raise DamagedReplyError(self.trouble) from None
+                yield from self._clear_line(isinstance(error, SilenceError))
+
+    def _poll(self) -> Script[tuple[TrackingReply, float]]:
+        self.counts.polls += 1
+        command = f"{'BX' if self.binary else 'TX'}:{OPTIONS:04X}"
+        kind = ReplyKind.BINARY if self.binary else ReplyKind.TEXT
+        length = 20 + BYTES_A_TOOL[self.binary] * len(self.session.tools)
+        timeout_s = max(0.2, 4.0 * 10.0 * length / self.session.speed)
+        try:
+            answer: Answer = yield Ask(command, timeout_s, kind)
+        except DeviceError as error:
+            if error.code != 0x01 or not self.binary or self.counts.frames:
+                raise
+            self.binary = False  # a device without BX
+            return (yield from self._poll())
+        reply = parse_bx(answer.data, OPTIONS) if self.binary else parse_tx(answer.data, OPTIONS)
+        return reply, answer.at_s
+
+    def _newest(self, reply: TrackingReply) -> int:
+        counts = [self.clock.unwrap(entry.frame) for entry in reply.handles if entry.frame is not None]
+        return max(counts, default=self.clock.count)
+
+    def _is_new(self, reply: TrackingReply) -> bool:
+        """Whether a frame was not seen before.
+
+        Raises
+        ------
+        BadReplyError
+            The frame numbers run backwards: an old reply, or a device that began anew.
+        """
+        newest = self._newest(reply)
+        if newest < self.clock.count:
+            raise BadReplyError(f"frame {newest} after frame {self.clock.count}")
+        return newest > self.clock.count
+
+    def _has_no_frame(self, reply: TrackingReply) -> bool:
+        """Whether no handle is there that could have a frame number."""
+        return all(entry.frame is None for entry in reply.handles)
+
+    def _clear_line(self, silent: bool) -> Script[None]:
+        """Make sure that the next reply is the next command's.
+
+        After silence a late reply may still come and would be taken for the next one's. The fence's
+        answer cannot be mistaken for it, and a device answers in order.
+        """
+        if silent:
+            self.counts.silent += 1
+        else:
+            self.counts.damaged += 1
+        yield Hush(0.005)
+        if silent:
+            try:
+                yield Ask(FENCE_COMMAND, FENCE_S, ReplyKind.FENCE)
+            except DeviceError:
+                return  # an error reply marks the place just as well
