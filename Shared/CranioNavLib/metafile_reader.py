@@ -165,8 +165,10 @@ def _check_layout(header: _Header) -> tuple[int, int]:
     dims, sizes = header.get("NDims"), header.get("DimSize").split()
     if dims not in {"2", "3"}:
         raise header.refuse(f"NDims is {dims or 'missing'}; a recording has NDims = 3 (DimSize = samples 1 frames)")
+    if not sizes:
+        raise header.refuse("DimSize is missing; expected 'DimSize = samples 1 frames'")
     if len(sizes) != int(dims) or not all(size.isdigit() for size in sizes):
-        raise header.refuse(f"DimSize is {' '.join(sizes) or 'missing'!r}; expected {dims} whole numbers (samples 1 frames)")
+        raise header.refuse(f"DimSize is {' '.join(sizes)!r}; expected {dims} whole numbers (samples 1 frames)")
     samples, rows, count = (int(size) for size in [*sizes, "1"][:3])
     if samples == 0 or rows == 0:
         return 0, count

@@ -1,0 +1,290 @@
+"""Writing recordings: round trips, other readers, and what is left when the process is killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK
+from CranioNavLib.errors import InputError
+from CranioNavLib.rigid import rigid
+from CranioNavLib.sequence_metafile import (
+    Acquisition,
+    Recording,
+    RecordingWriter,
+    journal_of,
+    read_recording,
+    recover,
+    write_recording,
+)
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+ACQUISITION = Acquisition(50e6, 5e6, 10.0, 2730.0)
+
+
+def a_recording(frames: int = 12, samples: int = 64, seed: int = 0) -> Recording:
+    rng = np.random.default_rng(seed)
+    statuses = tuple("MISSING" if k % 5 == 2 else "OK" for k in range(frames))
+    poses = rigid(Rotation.random(frames, random_state=seed).as_matrix(), rng.normal(0, 100, (frames, 3)))
+    poses[[status != "OK" for status in statuses]] = np.nan
+    return Recording(
+        lines=rng.integers(-32768, 32768, (frames, samples)).astype(np.int16),
+        acquisition=ACQUISITION,
+        probe_to_reference=poses,
+        statuses=statuses,
+        timestamps_s=np.cumsum(rng.uniform(0.01, 0.02, frames)),
+        palpation_points=rng.integers(-1, 18, frames),
+        other_transforms={"StylusToTracker": poses[::-1].copy()},
+        other_statuses={"StylusToTracker": statuses[::-1]},
+        fields={"CranioNavTimeZero": "start of recording"},
+    )
+
+
+def assert_same(a: Recording, b: Recording) -> None:
+    np.testing.assert_array_equal(a.lines, b.lines)
+    np.testing.assert_array_equal(a.probe_to_reference, b.probe_to_reference)
+    np.testing.assert_array_equal(a.timestamps_s, b.timestamps_s)
+    np.testing.assert_array_equal(a.palpation_points, b.palpation_points)
+    assert a.statuses == b.statuses
+    assert a.acquisition == b.acquisition
+    assert a.other_transforms.keys() == b.other_transforms.keys()
+    for name in a.other_transforms:
+        np.testing.assert_array_equal(a.other_transforms[name], b.other_transforms[name])
+    assert a.other_statuses == b.other_statuses
+    assert a.fields == b.fields
+
+
+def feed(writer: RecordingWriter, recording: Recording, first: int = 0) -> None:
+    for k in range(first, len(recording)):
+        writer.append(
+            float(recording.timestamps_s[k]),
+            {
+                "ProbeToReference": recording.probe_to_reference[k],
+                "StylusToTracker": recording.other_transforms["StylusToTracker"][k],
+            },
+            {"ProbeToReference": recording.statuses[k], "StylusToTracker": recording.other_statuses["StylusToTracker"][k]},
+            recording.lines[k],
+            int(recording.palpation_points[k]),
+        )
+
+
+@given(st.integers(1, 30), st.integers(1, 50), st.integers(0, 100))
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_recording_survives_the_disk_to_the_bit(tmp_path, frames, samples, seed):
+    recording = a_recording(frames, samples, seed)
+    write_recording(tmp_path / "r.igs.mha", recording)
+    read = read_recording(tmp_path / "r.igs.mha")
+    if all(status != "OK" for status in recording.other_statuses["StylusToTracker"]):
+        recording.other_transforms.clear()  # a stream without any pose leaves only its statuses
+        recording.other_statuses.clear()
+        read.other_transforms.clear()
+        read.other_statuses.clear()
+    assert_same(read, recording)
+
+
+def test_frame_by_frame_gives_the_same_as_at_once(tmp_path):
+    recording = a_recording()
+    with RecordingWriter(tmp_path / "b.igs.mha", 64, ACQUISITION, recording.fields) as writer:
+        feed(writer, recording)
+    write_recording(tmp_path / "a.igs.mha", recording)
+    assert (tmp_path / "a.igs.mha").read_bytes() == (tmp_path / "b.igs.mha").read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.igs.mha", "b.igs.mha"]
+
+
+def test_poses_only(tmp_path):
+    with RecordingWriter(tmp_path / "p.igs.mha") as writer:
+        writer.append(0.0, {"ProbeToReference": np.eye(4)})
+        writer.append(0.1, {"ProbeToReference": None})
+    recording = read_recording(tmp_path / "p.igs.mha")
+    assert recording.statuses == ("OK", "MISSING")
+    assert recording.lines.shape == (2, 0)
+
+
+def test_simpleitk_reads_lines_poses_and_statuses(tmp_path):
+    recording = a_recording()
+    write_recording(tmp_path / "r.igs.mha", recording)
+    image = SimpleITK.ReadImage(str(tmp_path / "r.igs.mha"))
+    np.testing.assert_array_equal(SimpleITK.GetArrayFromImage(image)[:, 0], recording.lines)
+    assert image.GetMetaData("Seq_Frame0002_ProbeToReferenceTransformStatus") == "MISSING"
+    numbers = np.array(image.GetMetaData("Seq_Frame0003_ProbeToReferenceTransform").split(), dtype=float)
+    np.testing.assert_array_equal(numbers.reshape(4, 4), recording.probe_to_reference[3])
+
+
+def test_what_simpleitk_writes_is_read_again(tmp_path):
+    recording = a_recording()
+    write_recording(tmp_path / "r.igs.mha", recording)
+    SimpleITK.WriteImage(SimpleITK.ReadImage(str(tmp_path / "r.igs.mha")), str(tmp_path / "s.mha"), useCompression=True)
+    again = read_recording(tmp_path / "s.mha")
+    np.testing.assert_array_equal(again.lines, recording.lines)
+    np.testing.assert_array_equal(again.probe_to_reference, recording.probe_to_reference)
+
+
+def slicer_items(path: Path) -> int:
+    """How many poses 3D Slicer's own storage node takes from the file."""
+    code = (
+        "import sys\nfrom slicer import vtkMRMLScene, vtkMRMLLinearTransformSequenceStorageNode\n"
+        "scene = vtkMRMLScene()\nnode = scene.AddNewNodeByClass('vtkMRMLSequenceNode')\n"
+        "storage = vtkMRMLLinearTransformSequenceStorageNode()\nscene.AddNode(storage)\n"
+        "storage.SetFileName(sys.argv[1])\nassert storage.ReadData(node) == 1\nprint(node.GetNumberOfDataNodes())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    return int(done.stdout.split()[-1])
+
+
+def test_slicer_reads_the_poses_and_leaves_out_missing_ones(tmp_path):
+    recording = a_recording()
+    recording.other_transforms.clear()
+    recording.other_statuses.clear()
+    write_recording(tmp_path / "r.seq.mha", recording)
+    assert slicer_items(tmp_path / "r.seq.mha") == sum(status == "OK" for status in recording.statuses)
+
+
+def test_a_growing_recording_is_readable_at_every_moment(tmp_path):
+    recording = a_recording()
+    writer = RecordingWriter(tmp_path / "g.igs.mha", 64, ACQUISITION)
+    for k in range(len(recording)):
+        writer.append(
+            float(recording.timestamps_s[k]), {"ProbeToReference": recording.probe_to_reference[k]}, line=recording.lines[k]
+        )
+        image = SimpleITK.ReadImage(str(writer.journal))
+        np.testing.assert_array_equal(SimpleITK.GetArrayFromImage(image)[:, 0], recording.lines[: k + 1])
+        if recording.statuses[0] == "OK":
+            assert len(read_recording(writer.journal)) == k + 1
+    writer.close()
+    writer.close()
+
+
+def test_a_killed_process_loses_at_most_100_ms(tmp_path):
+    code = (
+        "import sys, time, numpy as np\n"
+        "from CranioNavLib.sequence_metafile import RecordingWriter, Acquisition\n"
+        "writer = RecordingWriter(sys.argv[1], 3200, Acquisition(50e6, 5e6))\n"
+        "line = np.arange(3200, dtype=np.int16)\n"
+        "k = 0\n"
+        "while True:\n"
+        "    writer.append(k / 60, {'ProbeToReference': np.eye(4)}, line=line + k % 100)\n"
+        "    k += 1\n"
+        "    print(k, flush=True)\n"
+        "    time.sleep(1 / 240)\n"
+    )
+    target = tmp_path / "k.igs.mha"
+    process = subprocess.Popen([sys.executable, "-c", code, str(target)], stdout=subprocess.PIPE, text=True)
+    time.sleep(1.5)
+    process.send_signal(signal.SIGKILL if os.name == "posix" else signal.SIGTERM)
+    told = [int(line) for line in process.communicate()[0].split()]
+    assert len(told) > 20
+    with pytest.raises(InputError, match="interrupted; recover it"):
+        read_recording(target)
+    assert SimpleITK.ReadImage(str(journal_of(target))).GetSize()[2] >= told[-1] - 1
+    count = recover(target)
+    assert count >= told[-1]  # a frame is 17 ms; all that was acknowledged is there
+    recording = read_recording(target)
+    assert len(recording) == count
+    for k in range(count):
+        assert recording.lines[k, 0] == k % 100
+        assert recording.timestamps_s[k] == k / 60
+    assert SimpleITK.GetArrayFromImage(SimpleITK.ReadImage(str(target))).shape == (count, 1, 3200)
+    assert not journal_of(target).exists()
+
+
+@pytest.mark.parametrize("cut", range(0, 400, 23))
+def test_a_journal_cut_anywhere_keeps_its_whole_frames(tmp_path, cut):
+    recording = a_recording(6)
+    writer = RecordingWriter(tmp_path / "c.igs.mha", 64, ACQUISITION)
+    feed(writer, recording)
+    journal, raw = writer.journal, writer.journal.with_name("c.part.raw")
+    journal.write_bytes(journal.read_bytes()[: journal.stat().st_size - 4 * cut])
+    raw.write_bytes(raw.read_bytes()[: max(raw.stat().st_size - 2 * cut, 0)])
+    if cut > 320:  # less than one line of 64 samples is left
+        with pytest.raises(InputError, match="no whole frame"):
+            recover(tmp_path / "c.igs.mha")
+        return
+    count = recover(tmp_path / "c.igs.mha")
+    read = read_recording(tmp_path / "c.igs.mha")
+    assert len(read) == count
+    np.testing.assert_array_equal(read.lines, recording.lines[:count])
+    np.testing.assert_array_equal(read.probe_to_reference, recording.probe_to_reference[:count])
+
+
+def test_an_interrupted_recording_is_not_overwritten(tmp_path):
+    writer = RecordingWriter(tmp_path / "a.igs.mha")
+    writer.append(0.0, {"ProbeToReference": np.eye(4)})
+    with pytest.raises(InputError, match="interrupted recording; recover or remove it"):
+        RecordingWriter(tmp_path / "a.igs.mha")
+
+
+def test_nothing_to_recover_is_told(tmp_path):
+    with pytest.raises(InputError, match="nothing to recover"):
+        recover(tmp_path / "a.igs.mha")
+
+
+def test_a_recording_without_frames_leaves_no_file(tmp_path):
+    RecordingWriter(tmp_path / "a.igs.mha").close()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"timestamp_s": 0.5}, "the one before at 1.0 s"),
+        ({"timestamp_s": float("nan")}, "frame 1 is at nan s"),
+        ({"line": np.zeros(5, dtype=np.int16)}, "5 samples, expected 4"),
+        ({"line": None}, "0 samples, expected 4"),
+        ({"transforms": {"Probe": np.eye(4)}}, "'Probe' is not of the form"),
+        ({"transforms": {"AToBToC": np.eye(4)}}, "'AToBToC' is not of the form"),
+    ],
+)
+def test_a_frame_that_does_not_fit_is_refused_and_leaves_the_recording_whole(tmp_path, arguments, message):
+    writer = RecordingWriter(tmp_path / "a.igs.mha", 4, ACQUISITION)
+    good = {"timestamp_s": 1.0, "transforms": {"ProbeToReference": np.eye(4)}, "line": np.zeros(4, dtype=np.int16)}
+    writer.append(**good)
+    with pytest.raises(InputError, match=message):
+        writer.append(**{**good, **arguments})
+    writer.close()
+    assert len(read_recording(tmp_path / "a.igs.mha")) == 1
+    with pytest.raises(InputError, match="closed"):
+        writer.append(**good)
+
+
+@pytest.mark.parametrize("fields", [{"two words": "x"}, {"A": "x\ny"}, {"A": "Grüße"}, {"A": "x" * 1000}])
+def test_fields_that_other_readers_choke_on_are_refused(tmp_path, fields):
+    with pytest.raises(InputError, match="cannot be stored"):
+        RecordingWriter(tmp_path / "a.igs.mha", fields=fields)
+
+
+def test_another_ending_is_refused(tmp_path):
+    with pytest.raises(InputError, match="that ending"):
+        write_recording(tmp_path / "a.nrrd", a_recording())
+
+
+def test_a_folder_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(InputError, match="choose a folder"):
+        RecordingWriter(tmp_path / "none" / "a.igs.mha")
+
+
+@pytest.mark.slow
+def test_an_hour_at_60_hz_keeps_memory_flat(tmp_path):
+    code = (
+        "import sys, resource, numpy as np\n"
+        "from CranioNavLib.sequence_metafile import RecordingWriter, Acquisition\n"
+        "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "line = np.arange(3200, dtype=np.int16)\n"
+        "with RecordingWriter(sys.argv[1], 3200, Acquisition(50e6, 5e6)) as writer:\n"
+        "    for k in range(216000):\n"
+        "        writer.append(k / 60, {'ProbeToReference': np.eye(4)}, line=line)\n"
+        "        if k == 1000: early = peak()\n"
+        "print(early, peak())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "h.igs.mha")], capture_output=True, text=True, check=True)
+    early, late = (int(kilobytes) for kilobytes in done.stdout.split())
+    assert late - early < 8000  # kB, the closing included
+    assert (tmp_path / "h.igs.mha").stat().st_size > 216000 * 6400
