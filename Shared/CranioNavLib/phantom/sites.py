@@ -52,7 +52,7 @@ def outer_seats(bone: Surface, skin: Surface, rng: np.random.Generator) -> tuple
     hits = bone.cast(origins, -directions)
     found = np.isfinite(hits.distances_mm)
     directions = directions[found]
-    points: Array = origins[found] - directions * hits.distances_mm[found, None]
+    points = origins[found] - directions * hits.distances_mm[found, None]
     normals, spread = _smooth_normals(bone, points, directions)
     to_skin = skin.cast(points + 0.1 * normals, normals).distances_mm
     top, bottom = skin.vertices_mm[:, 2].max(), skin.vertices_mm[:, 2].min()
@@ -70,8 +70,8 @@ def _smooth_normals(bone: Surface, points: Array, directions: Array) -> tuple[Ar
     angles = np.arange(8) * np.pi / 4
     ring = np.concatenate([np.zeros((1, 2)), PROBE_OF_FLATNESS_MM * np.column_stack([np.cos(angles), np.sin(angles)])])
     starts = points[:, None] + ring[:, 0, None] * across[:, None] + ring[:, 1, None] * along[:, None] + 20 * directions[:, None]
-    ranges = bone.cast(starts.reshape(-1, 3), -np.repeat(directions, len(ring), axis=0)).distances_mm.reshape(len(points), -1)
-    ranges = np.where(np.isfinite(ranges), ranges, 1e3)
+    found = bone.cast(starts.reshape(-1, 3), -np.repeat(directions, len(ring), axis=0)).distances_mm
+    ranges = np.where(np.isfinite(found), found, 1e3).reshape(len(points), -1)
     design = np.column_stack([np.ones(len(ring)), ring])
     plane = ranges @ np.linalg.pinv(design).T
     spread = np.abs(ranges - plane @ design.T).max(axis=1)

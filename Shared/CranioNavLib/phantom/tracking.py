@@ -10,6 +10,7 @@ import numpy.typing as npt
 from CranioNavLib.phantom import constants
 from CranioNavLib.rigid import Array, check_points, rigid, rigid_from_vector
 
+STANDING_SHARE = float(np.sqrt(1 - constants.TRACKER_JITTER_SHARE**2))
 SOURCES = 2  # the tool, and the reference base against which it is expressed
 
 
@@ -35,12 +36,10 @@ class TrackerError:
         poses = np.asarray(tool_to_reference, dtype=float)
         _, group = np.unique(np.asarray(groups), return_inverse=True)
         count = int(group.max()) + 1 if len(group) else 0
-        jitter = constants.TRACKER_JITTER_SHARE
-        standing = np.sqrt(1 - jitter**2)
         for source in range(SOURCES):
-            shift = standing * self._shifts(rng, count)[group] + jitter * self._shifts(rng, len(poses))
-            turn = standing * rng.normal(size=(count, 3))[group] + jitter * rng.normal(size=(len(poses), 3))
-            turn *= constants.TRACKER_ROTATION_SD_RAD
+            standing, moving = draw_error(rng, count), draw_error(rng, len(poses))
+            drawn = STANDING_SHARE * standing[group] + constants.TRACKER_JITTER_SHARE * moving
+            turn, shift = drawn[:, :3], drawn[:, 3:] @ self.camera_to_reference.T
             if source == 0:  # the tool turns about its own marker frame, a lever away from its tip
                 pivots = poses[:, :3, 3] - poses[:, :3, 2] * constants.TOOL_ORIGIN_OFFSET_MM
                 poses = _moved(poses, turn, shift, pivots)
@@ -48,10 +47,18 @@ class TrackerError:
                 poses = _moved(poses, turn, shift, np.zeros((len(poses), 3)))
         return poses
 
-    def _shifts(self, rng: np.random.Generator, count: int) -> Array:
-        lateral, depth = constants.TRACKER_LATERAL_SD_MM, constants.TRACKER_DEPTH_SD_MM
-        shifts: Array = (rng.normal(size=(count, 3)) * (lateral, lateral, depth)) @ self.camera_to_reference.T
-        return shifts
+
+def draw_error(rng: np.random.Generator, count: int) -> Array:
+    """(count, 6) errors of one source in the camera's axes: rotation vector (rad), then shift (mm)."""
+    lateral, depth = constants.TRACKER_LATERAL_SD_MM, constants.TRACKER_DEPTH_SD_MM
+    turn = constants.TRACKER_ROTATION_SD_RAD
+    drawn: Array = rng.normal(size=(count, 6)) * (turn, turn, turn, lateral, lateral, depth)
+    return drawn
+
+
+def disturb(poses: Array, errors: Array, pivots: Array) -> Array:
+    """Poses (F, 4, 4) as seen with errors (F, 6), whose rotation is about `pivots` (F, 3)."""
+    return _moved(poses, errors[:, :3], errors[:, 3:], pivots)
 
 
 def _moved(poses: Array, turns: Array, shifts: Array, pivots: Array) -> Array:

@@ -95,21 +95,38 @@ def acquisition() -> Acquisition:
     return Acquisition(constants.SAMPLING_HZ, constants.TRANSDUCER_HZ, constants.FORERUN_LENGTH_MM, constants.FORERUN_SPEED_M_S)
 
 
+class LineSource:
+    """The probe on one patient: scatterers stay where they are from call to call."""
+
+    def __init__(self, bone: Surface, skin: Surface, tissue: Tissue, rng: np.random.Generator) -> None:
+        self._bone, self._skin, self._tissue, self._rng = bone, skin, tissue, rng
+        self._scatter = _Scatter(rng)
+
+    def lines(self, probe_to_ras: npt.ArrayLike, warming_k: npt.ArrayLike = 0.0) -> npt.NDArray[np.int16]:
+        """RF lines (F, N) for true probe poses (F, 4, 4): origin on the transducer's face, +z along the beam.
+
+        `warming_k` (F,) is how much the forerun has warmed during use.
+        """
+        poses = np.asarray(probe_to_ras, dtype=float).reshape(-1, 4, 4)
+        warming = np.broadcast_to(np.asarray(warming_k, dtype=float), (len(poses),))
+        lines = np.empty((len(poses), constants.LINE_SAMPLES), dtype=np.int16)
+        for start in range(0, len(poses), CHUNK):
+            part = slice(start, start + CHUNK)
+            spectra = _spectra(self._bone, self._skin, self._tissue, poses[part], warming[part], self._scatter, self._rng)
+            lines[part] = _digitise(_to_time(spectra), self._tissue.full_scale, self._rng)
+        return lines
+
+
 def simulate_lines(
     bone: Surface, skin: Surface, tissue: Tissue, probe_to_ras: npt.ArrayLike, rng: np.random.Generator
 ) -> npt.NDArray[np.int16]:
-    """RF lines (F, N) for true probe poses (F, 4, 4): origin on the transducer's face, +z along the beam."""
+    """RF lines (F, N) of one palpation, in the order in which they were taken; the forerun warms up meanwhile."""
     poses = np.asarray(probe_to_ras, dtype=float).reshape(-1, 4, 4)
-    lines = np.empty((len(poses), constants.LINE_SAMPLES), dtype=np.int16)
-    scatter = _Scatter(rng)
-    for start in range(0, len(poses), CHUNK):
-        part = slice(start, start + CHUNK)
-        warming = constants.FORERUN_WARMING_DURING_USE_K * np.arange(len(poses))[part] / max(len(poses), 1)
-        lines[part] = _chunk(bone, skin, tissue, poses[part], warming, scatter, rng)
-    return lines
+    warming = constants.FORERUN_WARMING_DURING_USE_K * np.arange(len(poses)) / max(len(poses), 1)
+    return LineSource(bone, skin, tissue, rng).lines(poses, warming)
 
 
-def _chunk(
+def _spectra(
     bone: Surface,
     skin: Surface,
     tissue: Tissue,
@@ -117,7 +134,7 @@ def _chunk(
     warming_k: Array,
     scatter: _Scatter,
     rng: np.random.Generator,
-) -> npt.NDArray[np.int16]:
+) -> Spectra:
     contact = poses.copy()
     contact[:, :3, 3] += poses[:, :3, 2] * constants.FORERUN_LENGTH_MM
     seen = look_at_bone(bone, contact)
@@ -130,7 +147,7 @@ def _chunk(
     spectra = _forerun(forerun_s, coupling) + _layers(tissue, seen, contact, speed, forerun_s, coupling)
     spectra += _bone(tissue, seen, speed, forerun_s, coupling, texture)
     spectra += _speckle(tissue, seen, speed, forerun_s, coupling, texture)
-    return _digitise(_to_time(spectra), tissue.full_scale, rng)
+    return spectra
 
 
 def _echoes(amplitude: Array, delay_s: Array, loss_s: Array | float = 0.0) -> Spectra:
