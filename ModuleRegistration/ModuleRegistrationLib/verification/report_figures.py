@@ -21,8 +21,8 @@ VIEWS = {
     "top": ((0, 0, 1), (0, 1, 0)),
 }
 VIEW_PIXELS = 430
+RESIDUAL_COLORS = "RdBu_r"  # told apart by the colour-blind too
 MAP_TRIANGLES = 40_000  # enough for a colour map that a report shows at 430 pixels
-RESIDUAL_SCALE_MM = 2.0
 
 
 def skull_with_points(result: CaseResult) -> bytes:
@@ -31,21 +31,23 @@ def skull_with_points(result: CaseResult) -> bytes:
 
     scene = _Views(result.bone.closed)
     registration = result.registration
-    cloud = None
+    cloud, limits = None, (-0.5, 0.5)
     if len(result.points):
         cloud = pyvista.PolyData(registration.points_ras_mm)
         cloud["residual (mm)"] = registration.residuals_mm
+        widest = float(np.ceil(2 * np.abs(registration.residuals_mm).max()) / 2)
+        limits = (-max(widest, 0.5), max(widest, 0.5))
     landmarks = transform_points(registration.reference_to_ras, result.landmarks_patient_mm)
     for plotter in scene.each():
         scene.add_bone(plotter)
         if cloud is not None:
-            balls = cloud.glyph(geom=pyvista.Sphere(radius=2.6), scale=False, orient=False)
-            limits = (-RESIDUAL_SCALE_MM, RESIDUAL_SCALE_MM)
-            plotter.add_mesh(balls, scalars="residual (mm)", cmap="coolwarm", clim=limits, show_scalar_bar=False, lighting=True)
+            balls = cloud.glyph(geom=pyvista.Sphere(radius=3.0), scale=False, orient=False)
+            plotter.add_mesh(balls, scalars="residual (mm)", cmap=RESIDUAL_COLORS, clim=limits, show_scalar_bar=False, ambient=0.4)
         _add_balls(plotter, landmarks, 2.4, "#e69f00")
         if result.case.targets_ct is not None:
             _add_balls(plotter, result.targets_ras_mm, 2.2, "#009e73")
-    return scene.picture()
+    title = "distance of a point to the bone surface (mm), + outside" if cloud is not None else None
+    return scene.picture((RESIDUAL_COLORS, limits, title) if title else None)
 
 
 def error_map(result: CaseResult) -> bytes | None:
@@ -107,24 +109,20 @@ class _Views:
         plotter.add_mesh(self.mesh, color=BONE_COLOR, smooth_shading=True, specular=0.15)
 
     def picture(self, color_bar: tuple[str, tuple[float, float], str] | None = None) -> bytes:
-        """PNG of the views, with a colour bar below."""
+        """PNG of the views, with a colour bar (map, limits, title) below."""
         import matplotlib as mpl
         from matplotlib.figure import Figure
 
         pixels = self._plotter.screenshot(return_img=True)
         self._plotter.close()
-        cmap, limits, title = color_bar or (
-            "coolwarm",
-            (-RESIDUAL_SCALE_MM, RESIDUAL_SCALE_MM),
-            "distance of a point to the bone surface (mm), + outside",
-        )
-        figure = Figure(figsize=(14, 4.3), dpi=110)
-        axes = figure.add_axes((0.0, 0.14, 1.0, 0.86))
+        figure = Figure(figsize=(14, 4.4), dpi=110)
+        axes = figure.add_axes((0.0, 0.17, 1.0, 0.83))
         axes.imshow(pixels)
         axes.set_axis_off()
-        bar = figure.add_axes((0.3, 0.09, 0.4, 0.03))
-        norm = mpl.colors.Normalize(*limits)
-        figure.colorbar(mpl.cm.ScalarMappable(norm, cmap), cax=bar, orientation="horizontal", label=title)
+        if color_bar is not None:
+            cmap, limits, title = color_bar
+            bar = figure.add_axes((0.3, 0.13, 0.4, 0.03))
+            figure.colorbar(mpl.cm.ScalarMappable(mpl.colors.Normalize(*limits), cmap), cax=bar, orientation="horizontal", label=title)
         return _png(figure)
 
 
@@ -196,7 +194,9 @@ def lines_with_echo(result: CaseResult, most: int = 18) -> bytes | None:
         depth = (np.arange(envelopes.values.shape[1]) / envelopes.rate_hz - measured.skin_times_s[frame]) * speed * 1000 / 2
         level = np.abs(envelopes.values[cell])
         shown = (depth > -3) & (depth < 22)
-        axes.plot(depth[shown], level[shown] / level[shown].max(), color="#333333", linewidth=0.8)
+        level_db = 20 * np.log10(np.maximum(level[shown] / level[shown].max(), 1e-4))
+        axes.plot(depth[shown], level_db, color="#333333", linewidth=0.8)
+        axes.set_ylim(-60, 3)
         axes.axvline(0, color="#0072b2", linewidth=1)
         axes.axvline(measured.depths_mm[frame], color="#d55e00", linewidth=1.4)
         point = int(recording.palpation_points[frame])
@@ -211,9 +211,9 @@ def lines_with_echo(result: CaseResult, most: int = 18) -> bytes | None:
             va="top",
         )
         axes.set_xlim(-3, 22)
-        axes.set_yticks([])
+        axes.set_yticks([-60, -40, -20, 0])
         axes.tick_params(labelsize=7)
-    figure.supxlabel("depth below the skin (mm); blue: skin, orange: bone found", fontsize=8)
+    figure.supxlabel("depth below the skin (mm) against level (dB below the highest); blue: skin, orange: bone found", fontsize=8)
     figure.tight_layout()
     return _png(figure)
 

@@ -1,0 +1,64 @@
+"""The workstation's application: one scene, Slicer's views, the three modules' panels as one procedure."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from CranioNavLib import host
+from CranioNavLib.panel import Panel
+from CranioNavLib.panel_model import PanelModel
+from trame.app import TrameApp
+
+from Workstation.web.background import BackgroundRunner
+from Workstation.web.page import Page
+from Workstation.web.panel_view import PanelView
+from Workstation.web.procedure import PROCEDURE
+
+REFRESH_S = 0.2  # read-outs; the views redraw by themselves when a node changes
+
+
+class WorkstationApp(TrameApp):
+    """Server side of the page. Everything that touches the scene runs in the event loop's thread."""
+
+    def __init__(self, server: Any = None) -> None:
+        super().__init__(server)
+        from trame_slicer import module as slicer_views
+        from trame_slicer.core import LayoutManager, SlicerApp
+        from trame_slicer.rca_view import register_rca_factories
+
+        self.server.enable_module(slicer_views)
+        with host.quiet():
+            self.slicer = SlicerApp()
+            host.adopt_scene(self.slicer.scene, self.slicer.app_logic)
+            register_rca_factories(self.slicer.view_manager, self.server)
+            self.layouts = LayoutManager(self.slicer.scene, self.slicer.view_manager, self.server)
+            self.layouts.register_layout_dict(LayoutManager.default_grid_configuration(), lazy_initialization=True)
+            self.layouts.set_layout("Quad View")
+        self.runner = BackgroundRunner()
+        self.panels: dict[str, PanelView] = {}
+        for panel, logic in _modules():
+            key = panel.module.replace("Module", "").lower()
+            self.panels[panel.module] = PanelView(self.server, PanelModel(panel, logic, self.runner), key)
+        self.page = Page(self.server, self.panels, self.layouts, PROCEDURE)
+        self.server.controller.on_server_ready.add_task(self._keep_fresh)
+
+    @property
+    def ui(self) -> Any:
+        """The page's layout, as trame's tools expect it."""
+        return self.page.layout
+
+    async def _keep_fresh(self, **_: Any) -> None:
+        while True:
+            await asyncio.sleep(REFRESH_S)
+            for panel in self.panels.values():
+                panel.refresh()
+
+
+def _modules() -> list[tuple[Panel, Any]]:
+    """Each module's panel with a logic on the host's scene."""
+    from ModuleRegistrationLib.panel_description import PANEL as REGISTRATION
+
+    from ModuleRegistration import ModuleRegistrationLogic
+
+    return [(REGISTRATION, ModuleRegistrationLogic())]

@@ -1,0 +1,33 @@
+"""Long work off the main thread: computed in a worker, brought back into the thread that owns the scene."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+
+class BackgroundRunner:
+    """Runs `compute` in a worker thread and `finished(result or exception)` in the server's event loop."""
+
+    def __init__(self) -> None:
+        self._workers = ThreadPoolExecutor(max_workers=1, thread_name_prefix="cranionav-work")
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def start(self, compute: Callable[[], Any], finished: Callable[[Any], None]) -> None:
+        """Return at once; called in the event loop's thread."""
+        task = asyncio.get_running_loop().create_task(self._run(compute, finished))
+        self._tasks.add(task)  # the loop itself keeps only a weak reference
+        task.add_done_callback(self._tasks.discard)
+
+    async def _run(self, compute: Callable[[], Any], finished: Callable[[Any], None]) -> None:
+        try:
+            outcome: Any = await asyncio.get_running_loop().run_in_executor(self._workers, compute)
+        except Exception as error:
+            outcome = error
+        finished(outcome)
+
+    def close(self) -> None:
+        """Wait for nothing more."""
+        self._workers.shutdown(wait=False, cancel_futures=True)

@@ -1,0 +1,75 @@
+"""The page: title bar, the procedure's steps, the open step's panel, Slicer's views."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from trame.ui.vuetify3 import VAppLayout
+from trame.widgets import client, html
+from trame.widgets import vuetify3 as v3
+from trame_slicer.app.ui.flex_container import FlexContainer
+
+from Workstation.web.panel_view import PanelView
+from Workstation.web.procedure import ProcedureStep
+
+SIGN_OF = "({ 'to do': '○', 'done': '✓', 'needs attention': '!' })"
+COLOR_OF = "({ 'to do': undefined, 'done': '#2fbf8f', 'needs attention': '#f0b429' })"
+STYLE = """
+html { overflow: hidden; }
+.v-application { font-size: 16px; }
+.step-sign { width: 26px; height: 26px; border-radius: 50%; border: 2px solid currentColor; text-align: center; line-height: 22px; font-weight: 700; }
+"""
+
+
+class Page:
+    """Builds the page once; everything that changes later is in the shared state."""
+
+    def __init__(self, server: Any, panels: dict[str, PanelView], layouts: Any, procedure: tuple[ProcedureStep, ...]) -> None:
+        self.server, self.panels = server, panels
+        server.state.step = procedure[0].name
+        server.state.trame__title = "CranioNav"
+        with VAppLayout(server) as self.layout:
+            self.layout.root.theme = "dark"
+            client.Style(STYLE)
+            self._draw_title()
+            self._draw_steps(procedure)
+            self._draw_open_step(procedure)
+            with v3.VMain(style="height: 100vh;"), FlexContainer(row=True, fill_height=True):
+                layouts.initialize_layout_grid(self.layout)
+
+    def _draw_title(self) -> None:
+        with v3.VAppBar(density="compact", flat=True, border=True):
+            v3.VAppBarTitle("CranioNav")
+            html.Div("Research software, not a medical device", classes="text-body-2 text-medium-emphasis mr-4")
+
+    def _draw_steps(self, procedure: tuple[ProcedureStep, ...]) -> None:
+        with v3.VNavigationDrawer(permanent=True, width=230), v3.VList(nav=True, density="comfortable"):
+            for number, step in enumerate(procedure, start=1):
+                state = self._state_of(step)
+                with v3.VListItem(
+                    title=f"{number}  {step.title}",
+                    active=(f"step === '{step.name}'",),
+                    click=f"step = '{step.name}'",
+                    color="primary",
+                    data_step=step.name,
+                ), v3.Template(v_slot_prepend=True):
+                    html.Div(
+                        f"{{{{ {SIGN_OF}[{state}] }}}}",
+                        classes="step-sign mr-3",
+                        style=(f"{{ color: {COLOR_OF}[{state}] }}",),
+                        title=(state,),
+                    )
+
+    def _draw_open_step(self, procedure: tuple[ProcedureStep, ...]) -> None:
+        with v3.VNavigationDrawer(permanent=True, width=340):
+            for number, step in enumerate(procedure, start=1):
+                with html.Div(v_show=f"step === '{step.name}'", classes="pa-4", data_panel=step.name):
+                    html.Div(f"{number}  {step.title}", classes="text-h6 mb-2")
+                    for module, name in step.parts:
+                        view = self.panels[module]
+                        view.draw(next(part for part in view.model.panel.steps if part.name == name))
+
+    def _state_of(self, step: ProcedureStep) -> str:
+        """A JavaScript expression: the state of the step's first part that is not done, else of its last."""
+        states = [f"{self.panels[module].key}.status['{name}'].state" for module, name in step.parts]
+        return f"([{', '.join(states)}].find(one => one !== 'done') || 'done')"

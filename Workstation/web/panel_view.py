@@ -1,0 +1,184 @@
+"""Draws a panel's steps with Vuetify. Holds no behaviour: it shows a panel's state and passes on what the user does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from CranioNavLib.panel import Action, FileField, Item, NodeField, ParameterField, PluginField, ReadOut, Step, label_of
+from CranioNavLib.panel_model import PanelModel
+from trame.widgets import html
+from trame.widgets import vuetify3 as v3
+
+from Workstation.web.panel_state import choices_of, panel_state, parse
+
+# Okabe and Ito's colours, which the colour-blind tell apart; a sign stands beside each.
+COLORS = "({ good: '#2fbf8f', warning: '#f0b429', bad: '#ff7b5c', plain: undefined })"
+SIGNS = "({ good: '✓ ', warning: '! ', bad: '✗ ', plain: '' })"
+
+
+class PanelView:
+    """One panel in the page; `key` names its state variable and its events."""
+
+    def __init__(self, server: Any, model: PanelModel, key: str) -> None:
+        self.server, self.model, self.key = server, model, key
+        self.refresh()
+        model.listen(self.refresh)
+        server.controller.trigger(f"{key}_change")(self._change)
+        server.controller.trigger(f"{key}_setting")(self._change_setting)
+        server.controller.trigger(f"{key}_run")(self._run)
+        server.controller.trigger(f"{key}_cancel")(self.model.cancel)
+
+    def refresh(self) -> None:
+        """Put the panel's present state into the page's."""
+        state = panel_state(self.model)
+        if self.server.state[self.key] != state:
+            with self.server.state as shared:
+                shared[self.key] = state
+
+    def draw(self, step: Step) -> None:
+        """The widgets of one step, in the current trame context."""
+        if step.help:
+            html.Div(step.help, classes="text-body-2 text-medium-emphasis mb-3")
+        html.Div(
+            f"{{{{ {self.key}.status['{step.name}'].text }}}}",
+            classes="text-body-2 mb-2",
+            v_if=f"{self.key}.status['{step.name}'].text",
+        )
+        for item in step.items:
+            self._draw_item(item)
+        self._draw_footer()
+
+    def _draw_item(self, item: Item) -> None:
+        if isinstance(item, Action):
+            self._draw_action(item)
+        elif isinstance(item, ReadOut):
+            self._draw_reading(item)
+        elif isinstance(item, NodeField):
+            with html.Div(classes="d-flex text-body-2 py-1"):
+                html.Span(item.label, classes="text-medium-emphasis flex-grow-1")
+                html.Span(f"{{{{ {self.key}.nodes['{item.role}'] }}}}")
+        elif isinstance(item, PluginField):
+            self._draw_plugin(item)
+        else:
+            self._draw_parameter(item)
+
+    def _draw_action(self, item: Action) -> None:
+        with html.Div(classes="my-2", title=(f"{self.key}.blocked['{item.name}'] || '{_quoted(item.help)}'",)):
+            v3.VBtn(
+                item.label,
+                block=True,
+                color="primary" if item.primary else None,
+                variant="flat" if item.primary else "tonal",
+                disabled=(f"!!{self.key}.blocked['{item.name}']",),
+                click=f"trigger('{self.key}_run', ['{item.name}'])",
+                data_action=item.name,
+            )
+            html.Div(
+                f"{{{{ {self.key}.blocked['{item.name}'] }}}}",
+                v_if=f"{self.key}.blocked['{item.name}'] && !{self.key}.busy",
+                classes="text-caption text-medium-emphasis mt-1",
+            )
+
+    def _draw_reading(self, item: ReadOut) -> None:
+        reading = f"{self.key}.readings['{item.name}']"
+        with html.Div(classes="py-1"):
+            html.Div(item.label, classes="text-caption text-medium-emphasis")
+            html.Div(
+                f"{{{{ {SIGNS}[{reading}.level] + {reading}.text }}}} {item.unit}",
+                classes="text-h4 font-weight-medium" if item.large else "text-body-1",
+                style=(f"{{ color: {COLORS}[{reading}.level], lineHeight: 1.2 }}",),
+                data_reading=item.name,
+            )
+
+    def _draw_parameter(self, item: ParameterField | FileField) -> None:
+        info = self.model.describe(item)
+        common = {
+            "label": label_of(self.model.panel, item),
+            "model_value": (f"{self.key}.fields['{item.name}']",),
+            "hint": info.help,
+            "error_messages": (f"{self.key}.errors['{item.name}']",),
+            "density": "compact",
+            "variant": "outlined",
+            "hide_details": "auto",
+            "classes": "my-2",
+            "data_field": item.name,
+        }
+        changed = f"trigger('{self.key}_change', ['{item.name}', $event])"
+        if info.kind is bool:
+            v3.VSwitch(update_modelValue=changed, color="primary", **common)
+        elif choices_of(info):
+            v3.VSelect(items=(repr(choices_of(info)),), update_modelValue=changed, **common)
+        else:
+            entered = f"trigger('{self.key}_change', ['{item.name}', $event.target.value])"
+            v3.VTextField(suffix=info.unit, change=entered, type="number" if info.kind in (int, float) else "text", **common)
+
+    def _draw_plugin(self, item: PluginField) -> None:
+        v3.VSelect(
+            label=item.label,
+            model_value=(f"{self.key}.fields['{item.name}']",),
+            items=(repr(self.model.choices(item)),),
+            update_modelValue=f"trigger('{self.key}_change', ['{item.name}', $event])",
+            error_messages=(f"{self.key}.errors['{item.name}']",),
+            density="compact",
+            variant="outlined",
+            hide_details="auto",
+            classes="my-2",
+            data_field=item.name,
+        )
+        changed = f"trigger('{self.key}_setting', ['{item.name}', one.name, $event])"
+        entered = f"trigger('{self.key}_setting', ['{item.name}', one.name, $event.target.value])"
+        with (
+            v3.VExpansionPanels(v_if=f"{self.key}.settings['{item.name}'].length", variant="accordion", classes="my-2"),
+            v3.VExpansionPanel(title="Settings"),
+            v3.VExpansionPanelText(),
+            html.Div(v_for=f"one in {self.key}.settings['{item.name}']", key="one.key", classes="my-2"),
+        ):
+            shared = {
+                "label": ("one.name.replaceAll('_', ' ')",),
+                "model_value": ("one.value",),
+                "hint": ("one.help",),
+                "error_messages": (f"{self.key}.errors[one.key]",),
+                "density": "compact",
+                "variant": "outlined",
+                "hide_details": "auto",
+            }
+            v3.VSwitch(v_if="one.switch", update_modelValue=changed, color="primary", **shared)
+            v3.VSelect(v_else_if="one.choices", items=("one.choices",), update_modelValue=changed, **shared)
+            v3.VTextField(v_else=True, change=entered, suffix=("one.unit",), **shared)
+
+    def _draw_footer(self) -> None:
+        with html.Div(v_if=f"{self.key}.busy", classes="my-3"):
+            html.Div(f"{{{{ {self.key}.busy.text || {self.key}.busy.label }}}} …", classes="text-body-2")
+            v3.VProgressLinear(
+                model_value=(f"100 * {self.key}.busy.share",), indeterminate=(f"!{self.key}.busy.share",), height=6
+            )
+            v3.VBtn("Cancel", size="small", variant="text", click=f"trigger('{self.key}_cancel')")
+        html.Div(
+            f"{{{{ {SIGNS}[{self.key}.message.level] + {self.key}.message.text }}}}",
+            v_if=f"{self.key}.message.text",
+            style=(f"{{ color: {COLORS}[{self.key}.message.level] }}",),
+            classes="text-body-1 my-3",
+            data_message=self.key,
+        )
+
+    def _change(self, name: str, value: Any) -> None:
+        field = self._field(name)
+        self.model.change(field, parse(self.model.describe(field), value))
+
+    def _change_setting(self, name: str, setting: str, value: Any) -> None:
+        field = self._field(name)
+        door = self.model.settings(field)
+        if door is not None:
+            info = next(one for one in door.kind.describe() if one.name == setting)
+            self.model.change_setting(field, setting, parse(info, value))
+
+    def _run(self, name: str) -> None:
+        self.model.run(next(action for action in self.model.panel.actions() if action.name == name))
+
+    def _field(self, name: str) -> Any:
+        fields = (item for item in self.model.panel.items() if isinstance(item, (ParameterField, FileField, PluginField)))
+        return next(item for item in fields if item.name == name)
+
+
+def _quoted(text: str) -> str:
+    return text.replace("\\", "\\\\").replace("'", "\\'")
