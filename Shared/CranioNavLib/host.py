@@ -47,12 +47,12 @@ PACKAGES = {"scipy": "scipy", "open3d": "open3d", "serial": "pyserial", "jinja2"
 
 @dataclass
 class _Host:
-    """The one scene of this process and what must live as long as it."""
+    """The one scene of this process. A scene and its logics point at each other, so nothing of them is ever let go."""
 
     scene: Any = None
-    application_logic: Any = None
     thread: int = 0  # only this thread may write nodes
-    logics: list[Any] = field(default_factory=list)
+    application_logics: list[tuple[Any, Any]] = field(default_factory=list)  # (scene, its application logic)
+    kept: list[Any] = field(default_factory=list)
 
 
 _host = _Host()
@@ -99,12 +99,13 @@ def adopt_scene(mrml_scene: Any, application_logic: Any = None) -> Any:
     """
     package = slicer_package()
     _host.scene, _host.thread = mrml_scene, threading.get_ident()
-    if application_logic is not None:
-        _host.application_logic = application_logic
-    elif _host.application_logic is None or _host.application_logic.GetMRMLScene() is not mrml_scene:
-        _host.application_logic = _application_logic(package, mrml_scene)
-    _register_logics(package)
-    _allow_bundles(package)
+    known = [logic for scene_of_it, logic in _host.application_logics if scene_of_it is mrml_scene]
+    if application_logic is None:
+        application_logic = known[0] if known else _application_logic(package, mrml_scene)
+    if application_logic not in known:
+        _host.application_logics.append((mrml_scene, application_logic))
+    _register_logics(package, application_logic)
+    _allow_bundles(package, application_logic)
     package.mrmlScene = mrml_scene
     return mrml_scene
 
@@ -180,9 +181,8 @@ def _application_logic(package: Any, mrml_scene: Any) -> Any:
     return logic
 
 
-def _register_logics(package: Any) -> None:
+def _register_logics(package: Any, application_logic: Any) -> None:
     """Each logic that the application logic does not hold yet; setting its scene registers its node classes."""
-    application_logic = _host.application_logic
     for name, class_name in MODULE_LOGICS.items():
         with quiet():
             known = application_logic.GetModuleLogic(name)
@@ -192,24 +192,24 @@ def _register_logics(package: Any) -> None:
         logic.SetMRMLScene(_host.scene)
         logic.SetMRMLApplicationLogic(application_logic)
         application_logic.SetModuleLogic(name, logic)
-        _host.logics.append(logic)
+        _host.kept.append(logic)
 
 
-def _allow_bundles(package: Any) -> None:
+def _allow_bundles(package: Any, application_logic: Any) -> None:
     """Give the scene the input/output manager without which sequences and .mrb files cannot be read."""
     if _host.scene.GetDataIOManager() is not None:
         return
     folder = tempfile.TemporaryDirectory(prefix="cranionav-")  # removed when the process ends
     remote = package.vtkMRMLRemoteIOLogic()
     remote.SetMRMLScene(_host.scene)
-    remote.SetMRMLApplicationLogic(_host.application_logic)
+    remote.SetMRMLApplicationLogic(application_logic)
     remote.GetCacheManager().SetRemoteCacheDirectory(folder.name)
     manager = package.vtkDataIOManagerLogic()
     manager.SetMRMLScene(_host.scene)
-    manager.SetMRMLApplicationLogic(_host.application_logic)
+    manager.SetMRMLApplicationLogic(application_logic)
     manager.SetAndObserveDataIOManager(remote.GetDataIOManager())
     remote.AddDataIOToScene()
-    _host.logics += [folder, remote, manager]
+    _host.kept += [folder, remote, manager]
 
 
 def __getattr__(name: str) -> Any:
