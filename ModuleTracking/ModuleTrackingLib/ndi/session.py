@@ -39,6 +39,7 @@ from ModuleTrackingLib.ndi.steps import (
 )
 
 POWER_ON_SPEED = 9600
+NETWORK_SPEED = 10_000_000  # bits a second, for time-outs only
 SETTLE_S = 0.1  # after INIT and after a change of speed
 PROBE_S = 0.25  # a device that is there answers PROBE long before
 PROBE = "APIREV:"  # harmless in every mode; an error reply is an answer too
@@ -178,7 +179,7 @@ class Session:
             return
         self.say("connecting", "opening the port" if not failures else f"opening the port (attempt {failures + 1})")
         yield Connect()
-        self._connected, self.speed = True, POWER_ON_SPEED
+        self._connected, self.speed = True, POWER_ON_SPEED if self.has_speeds() else NETWORK_SPEED
 
     def _reach(self) -> Script[None]:
         """Return at the speed at which the device answers, in whatever mode it is.
@@ -352,6 +353,11 @@ class Session:
             if key in self.plan.names:
                 return self.plan.names[key]
         return info.part_number or f"Tool {handle:02X}"
+
+    @property
+    def line(self) -> str:
+        """The line in words."""
+        return f"{self.speed} baud" if self.has_speeds() else "the network's speed"
 
     # -- one command ---------------------------------------------------------------------------
 

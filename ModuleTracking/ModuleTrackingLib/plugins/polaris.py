@@ -209,7 +209,7 @@ class PolarisTracker(Tracker):
     def _track(self) -> Poller:
         _, session = self._opened
         self._poller = Poller(session, self.settings.replies is not Replies.TEXT, self.clock.now)
-        self._go(PolarisState.TRACKING, f"{len(session.tools)} tools at {session.speed} baud")
+        self._go(PolarisState.TRACKING, f"{len(session.tools)} tools at {session.line}")
         return self._poller
 
     def _next_frame(self, deadline_s: float) -> list[ToolPose]:

@@ -19,6 +19,7 @@ from ModuleTrackingLib.ndi.emulator.station import Station
 
 IDLE_S = 0.2  # the longest sleep: signals and timed faults are seen this soon
 HUNG_UP_S = 0.01  # how often a closed pseudo-terminal is looked at
+LINUX_TCGETS2, LINUX_TERMIOS2_BYTES = 0x802C542A, 44  # asm-generic/ioctls.h; the last word is the output speed
 
 
 class Line(ABC):
@@ -106,7 +107,19 @@ class TerminalLine(Line):
                 os.write(self._host, data)
 
     def host_speed(self) -> Optional[int]:
-        return self._speeds.get(self._termios.tcgetattr(self._host)[5], 0)
+        speed = self._speeds.get(self._termios.tcgetattr(self._host)[5], 0)
+        return speed or self._any_speed()
+
+    def _any_speed(self) -> int:
+        """A speed that has no constant of its own, such as 1228739: Linux tells it by another request."""
+        import fcntl
+
+        settings = bytearray(LINUX_TERMIOS2_BYTES)
+        try:
+            fcntl.ioctl(self._host, LINUX_TCGETS2, settings)
+        except OSError:
+            return 0
+        return int.from_bytes(settings[-4:], sys.byteorder)
 
     def hung_up(self) -> bool:
         self._look()
