@@ -18,7 +18,7 @@ from CranioNavLib import host, scene
 from CranioNavLib.bone_points import BonePoints
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array, check_rigid
-from CranioNavLib.slicer_files import LabelledPoints, points_of_node
+from CranioNavLib.slicer_files import LabelledPoints, add_points, points_of_node
 from CranioNavLib.surface import Surface
 from CranioNavLib.volume import Volume
 
@@ -33,8 +33,7 @@ def set_points(role: str, points: LabelledPoints) -> Any:
     with host.slicer_package().util.NodeModify(node):
         node.RemoveAllControlPoints()
         _forget_measurements(node)
-        for label, position in zip(points.labels, points.positions_mm):
-            node.AddControlPoint([float(value) for value in position], label)
+        add_points(node, points)
     return node
 
 

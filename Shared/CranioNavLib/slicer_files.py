@@ -6,9 +6,12 @@ They alone know about LPS on disk and RAS in memory; no sign is flipped here.
 from __future__ import annotations
 
 import json
+import os
 import re
 import tempfile
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -92,9 +95,15 @@ def write_points(path: str | Path, points: LabelledPoints, name: str = "Points")
     slicer = _ready()
     node = slicer.vtkMRMLMarkupsFiducialNode()
     node.SetName(name)
-    for label, position in zip(points.labels, points.positions_mm):
-        node.AddControlPoint([float(value) for value in position], label)
+    add_points(node, points)
     _write(path, slicer.vtkMRMLMarkupsJsonStorageNode(), node)
+
+
+def add_points(node: Any, points: LabelledPoints) -> None:
+    """Add control points to a markups node, in the node's own frame."""
+    for label, position in zip(points.labels, points.positions_mm):
+        index = node.AddControlPoint([float(value) for value in position], label)
+        node.SetNthControlPointLabel(index, label)  # an empty label would have been replaced by a number
 
 
 def read_transform(path: str | Path) -> Array:
@@ -206,11 +215,27 @@ def _read(path: Path, storage_class: str, node_class: str) -> Any:
     slicer = _ready()
     storage, node = getattr(slicer, storage_class)(), getattr(slicer, node_class)()
     storage.SetFileName(str(path))
-    with host.quiet() as said:
+    with host.quiet() as said, _quiet_hdf5(path):
         read = storage.ReadData(node)
     if not read:
         raise InputError(f"cannot read {path}: {_reason(said)}; it is cut off or of another kind")
     return node
+
+
+@contextmanager
+def _quiet_hdf5(path: Path) -> Iterator[None]:
+    """HDF5 writes what it thinks of a damaged file straight to file descriptor 2; for such a file it is led away."""
+    if path.suffix.lower() != ".h5":
+        yield
+        return
+    shown, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(shown, 2)
+        os.close(shown)
+        os.close(nowhere)
 
 
 def _write(path: Path, storage: Any, node: Any) -> None:
