@@ -17,7 +17,8 @@ COLOR_OF = "({ 'to do': undefined, 'done': '#2fbf8f', 'needs attention': '#f0b42
 STYLE = """
 html { overflow: hidden; }
 .v-application { font-size: 16px; }
-.step-sign { width: 26px; height: 26px; border-radius: 50%; border: 2px solid currentColor; text-align: center; line-height: 22px; font-weight: 700; }
+.step-sign { width: 26px; height: 26px; border-radius: 50%; border: 2px solid currentColor;
+  text-align: center; line-height: 22px; font-weight: 700; }
 """
 
 
@@ -46,13 +47,16 @@ class Page:
         with v3.VNavigationDrawer(permanent=True, width=230), v3.VList(nav=True, density="comfortable"):
             for number, step in enumerate(procedure, start=1):
                 state = self._state_of(step)
-                with v3.VListItem(
-                    title=f"{number}  {step.title}",
-                    active=(f"step === '{step.name}'",),
-                    click=f"step = '{step.name}'",
-                    color="primary",
-                    data_step=step.name,
-                ), v3.Template(v_slot_prepend=True):
+                with (
+                    v3.VListItem(
+                        title=f"{number}  {step.title}",
+                        active=(f"step === '{step.name}'",),
+                        click=f"step = '{step.name}'",
+                        color="primary",
+                        raw_attrs=[f'data-step="{step.name}"'],
+                    ),
+                    v3.Template(v_slot_prepend=True),
+                ):
                     html.Div(
                         f"{{{{ {SIGN_OF}[{state}] }}}}",
                         classes="step-sign mr-3",
@@ -63,7 +67,7 @@ class Page:
     def _draw_open_step(self, procedure: tuple[ProcedureStep, ...]) -> None:
         with v3.VNavigationDrawer(permanent=True, width=340):
             for number, step in enumerate(procedure, start=1):
-                with html.Div(v_show=f"step === '{step.name}'", classes="pa-4", data_panel=step.name):
+                with html.Div(v_show=f"step === '{step.name}'", classes="pa-4", raw_attrs=[f'data-panel="{step.name}"']):
                     html.Div(f"{number}  {step.title}", classes="text-h6 mb-2")
                     for module, name in step.parts:
                         view = self.panels[module]

@@ -71,7 +71,7 @@ class PanelView:
                 variant="flat" if item.primary else "tonal",
                 disabled=(f"!!{self.key}.blocked['{item.name}']",),
                 click=f"trigger('{self.key}_run', ['{item.name}'])",
-                data_action=item.name,
+                raw_attrs=[f'data-action="{item.name}"'],
             )
             html.Div(
                 f"{{{{ {self.key}.blocked['{item.name}'] }}}}",
@@ -87,7 +87,7 @@ class PanelView:
                 f"{{{{ {SIGNS}[{reading}.level] + {reading}.text }}}} {item.unit}",
                 classes="text-h4 font-weight-medium" if item.large else "text-body-1",
                 style=(f"{{ color: {COLORS}[{reading}.level], lineHeight: 1.2 }}",),
-                data_reading=item.name,
+                raw_attrs=[f'data-reading="{item.name}"'],
             )
 
     def _draw_parameter(self, item: ParameterField | FileField) -> None:
@@ -101,7 +101,7 @@ class PanelView:
             "variant": "outlined",
             "hide_details": "auto",
             "classes": "my-2",
-            "data_field": item.name,
+            "raw_attrs": [f'data-field="{item.name}"'],
         }
         changed = f"trigger('{self.key}_change', ['{item.name}', $event])"
         if info.kind is bool:
@@ -123,7 +123,7 @@ class PanelView:
             variant="outlined",
             hide_details="auto",
             classes="my-2",
-            data_field=item.name,
+            raw_attrs=[f'data-field="{item.name}"'],
         )
         changed = f"trigger('{self.key}_setting', ['{item.name}', one.name, $event])"
         entered = f"trigger('{self.key}_setting', ['{item.name}', one.name, $event.target.value])"
@@ -158,7 +158,7 @@ class PanelView:
             v_if=f"{self.key}.message.text",
             style=(f"{{ color: {COLORS}[{self.key}.message.level] }}",),
             classes="text-body-1 my-3",
-            data_message=self.key,
+            raw_attrs=[f'data-message="{self.key}"'],
         )
 
     def _change(self, name: str, value: Any) -> None:
