@@ -72,6 +72,14 @@ def noise_level(levels: Levels) -> Array:
     return np.asarray(np.exp(means.min(axis=1).astype(float) - LOG_RAYLEIGH))
 
 
+def rough_noise(magnitude: Floats) -> Array:
+    """As noise_level, but from the envelope itself: a little too high, and cheap."""
+    count, length = magnitude.shape
+    block = max(length // NOISE_BLOCKS, 1)
+    means = magnitude[:, : block * (length // block)].reshape(count, -1, block).mean(axis=2)
+    return np.asarray(means.min(axis=1).astype(float) / np.sqrt(np.pi / 2)) + 1e-6
+
+
 def refine_peaks(magnitude: Floats, samples: npt.NDArray[np.int64]) -> tuple[Array, Array]:
     """Sub-sample positions (in samples) and heights of peaks, by a parabola through the logarithm; NaN for padding."""
     positions, heights, _ = _fit_tops(magnitude, samples)
@@ -103,23 +111,28 @@ def salient_peaks(levels: Levels, rate_hz: float, rise_db_per_s: float, first: i
     score = 1.3 * here + 0.3 * rise - around
     peak = (here > levels.log[:, first : last - 2]) & (here >= levels.log[:, first + 2 : last])
     score = np.where(peak, score, np.float32(-np.inf))
-    keep = min(CANDIDATES, score.shape[1])
-    top = np.argpartition(score, score.shape[1] - keep, axis=1)[:, -keep:]
-    heights = np.take_along_axis(score, top, axis=1)
-    order = np.argsort(-heights, axis=1)
-    top, heights = np.take_along_axis(top, order, axis=1), np.take_along_axis(heights, order, axis=1)
-    samples = np.where(np.isfinite(heights), top + first + 1, -1)
-    return np.pad(samples, ((0, 0), (0, CANDIDATES - keep)), constant_values=-1)
+    samples = np.full((len(score), CANDIDATES), -1, dtype=np.int64)
+    rows = np.arange(len(score))
+    for rank in range(CANDIDATES):  # a few passes of argmax cost less than sorting every line
+        best = score.argmax(axis=1)
+        samples[:, rank] = np.where(np.isfinite(score[rows, best]), best + first + 1, -1)
+        score[rows, best] = -np.inf
+    return samples
 
 
 def find_candidates(
-    envelopes: Envelopes, levels: Levels, noise: Array, skin_s: Array, window_s: tuple[float, float], transducer_hz: float
+    envelopes: Envelopes,
+    magnitude: Floats,
+    levels: Levels,
+    skin_s: Array,
+    window_s: tuple[float, float],
+    transducer_hz: float,
 ) -> Candidates:
     """The most salient echoes within `window_s` (least, most) behind the skin echo of each line.
 
     The search runs over the window common to all lines of the batch (the skin moves by a few samples only).
     """
-    magnitude = np.abs(envelopes.values)
+    noise = noise_level(levels)
     rate = envelopes.rate_hz
     skin = float(np.median(skin_s))
     first = max(int((skin + window_s[0]) * rate), 0)
@@ -157,3 +170,11 @@ def concatenate(parts: list[Candidates]) -> Candidates:
     """The candidates of several batches as one."""
     names = Candidates.__dataclass_fields__
     return Candidates(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
+def reorder(candidates: Candidates, order: npt.NDArray[np.int64]) -> Candidates:
+    """The candidates of each line in another order, indices (n, K)."""
+    values = {name: getattr(candidates, name) for name in Candidates.__dataclass_fields__}
+    return Candidates(
+        **{name: np.take_along_axis(value, order, axis=1) if value.ndim == 2 else value for name, value in values.items()}
+    )

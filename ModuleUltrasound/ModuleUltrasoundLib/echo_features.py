@@ -25,7 +25,9 @@ NAMES = (
 )  # fmt: skip
 
 
-def line_features(candidates: Candidates, forerun: Forerun, nominal_skin_s: float, transducer_hz: float, speed_m_s: float) -> Array:
+def line_features(
+    candidates: Candidates, forerun: Forerun, nominal_skin_s: float, transducer_hz: float, speed_m_s: float
+) -> Array:
     """Features (n, K, len(NAMES)) of each candidate from its own line alone; NaN candidates give finite numbers."""
     snr = candidates.snrs_db
     valid = np.isfinite(snr)

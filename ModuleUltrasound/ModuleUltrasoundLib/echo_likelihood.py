@@ -5,12 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from CranioNavLib.rigid import Array
 
-from ModuleUltrasoundLib.echo_candidates import DECIBEL, Candidates
+from scipy.ndimage import gaussian_filter1d
 
-SAME_MM = 0.35  # candidates of neighbouring lines nearer than this support each other
-REACH = 2  # neighbouring lines on each side
+from ModuleUltrasoundLib.echo_candidates import DECIBEL, Candidates
+from ModuleUltrasoundLib.echo_search import Found
+
+SAME_MM = 0.35  # SD of a hand's tremor along the beam from line to line: how near candidates support each other
+BIN_MM = 0.1
+REACH = 4  # neighbouring lines on each side
 LEAST_FOR_SHARED = 3  # lines with a likely bone before anything is learnt from the recording
 
 
@@ -26,15 +31,15 @@ class Network:
     @classmethod
     def from_table(cls, table: Table) -> Network:
         """The network whose numbers stand in a table (see echo_weights.py)."""
-        return cls(tuple((np.array(weights, dtype=float), np.array(biases, dtype=float)) for weights, biases in table))
+        return cls(tuple((np.array(weights, dtype=np.float32), np.array(biases, dtype=np.float32)) for weights, biases in table))
 
     def scores(self, features: Array) -> Array:
         """Log-odds (n, K) of features (n, K, D)."""
-        x = features
+        x = features.astype(np.float32)
         for weights, biases in self.layers[:-1]:
             x = np.tanh(x @ weights + biases)
         weights, biases = self.layers[-1]
-        return np.asarray((x @ weights + biases)[..., 0])
+        return np.asarray((x @ weights + biases)[..., 0], dtype=float)
 
 
 def probabilities(scores: Array, valid: Array) -> tuple[Array, Array]:
@@ -47,18 +52,29 @@ def probabilities(scores: Array, valid: Array) -> tuple[Array, Array]:
     return weight / total, (none / total)[:, 0]
 
 
-SHARED_NAMES = ("single", "strength", "strength known", "polarity", "polarity known", "support", "has neighbours", "static")
+SHARED_NAMES = (
+    "single",
+    "strength",
+    "strength known",
+    "polarity",
+    "polarity known",
+    "support",
+    "has neighbours",
+    "static",
+    "contact",
+)
 
 
-def shared_features(candidates: Candidates, forerun_phase: Array, scores: Array, depth_mm: Array, runs: Array, spots: Array) -> Array:
+def shared_features(found: Found, scores: Array, runs: npt.NDArray[np.int64]) -> Array:
     """Features (n, K, len(SHARED_NAMES)) of each candidate from all lines of the recording.
 
-    `runs` (n,) numbers stretches of consecutive frames that may support each other, `spots` (n,) places on the head.
+    `runs` (n,) numbers stretches of consecutive frames from one place on the head, which may support each other.
     """
+    candidates, depth_mm = found.candidates, found.depths_mm
     valid = np.isfinite(depth_mm)
     chance, _ = probabilities(scores, valid)
     strength, strength_known = relative_strength(candidates, chance, depth_mm)
-    polarity, polarity_known = relative_polarity(candidates.phases - forerun_phase[:, None], chance)
+    polarity, polarity_known = relative_polarity(candidates.phases - found.forerun_phases[:, None], chance)
     support, neighbours = neighbour_support(chance, depth_mm, runs)
     features = [
         np.clip(scores, -8, 8) / 4,
@@ -68,7 +84,8 @@ def shared_features(candidates: Candidates, forerun_phase: Array, scores: Array,
         np.full(scores.shape, polarity_known),
         support,
         np.broadcast_to(neighbours[:, None], scores.shape),
-        static_share(depth_mm, spots),
+        static_share(depth_mm, runs),
+        np.broadcast_to(contact(found.forerun.amplitude)[:, None], scores.shape),
     ]
     return np.nan_to_num(np.stack([np.where(valid, feature, 0.0) for feature in features], axis=-1))
 
@@ -113,24 +130,40 @@ def relative_polarity(phases: Array, chance: Array) -> tuple[Array, float]:
     return np.cos(phases - np.angle(mean)) * known, known
 
 
-def neighbour_support(chance: Array, depth_mm: Array, runs: Array) -> tuple[Array, Array]:
+def neighbour_support(chance: Array, depth_mm: Array, runs: npt.NDArray[np.int64]) -> tuple[Array, Array]:
     """Mean chance (n, K) that the neighbouring lines give to the same depth, and whether a line has neighbours (n,)."""
     count = len(chance)
-    support = np.zeros(chance.shape)
+    rows = np.arange(count)
+    bins = np.nan_to_num(depth_mm / BIN_MM, nan=-1.0).astype(np.int64)
+    size = int(bins.max(initial=0)) + 2
+    spread = np.zeros((count, size), dtype=np.float32)
+    for rank in range(chance.shape[1]):  # one after the other, because two candidates may share a bin
+        spread[rows, bins[:, rank]] += np.where(bins[:, rank] >= 0, chance[:, rank], 0)
+    spread[:, -1] = 0
+    spread = gaussian_filter1d(spread, SAME_MM / BIN_MM, axis=1, mode="constant", truncate=2.0)
+    spread *= np.sqrt(2 * np.pi) * SAME_MM / BIN_MM  # a neighbour at the very depth counts fully
+    support = np.zeros_like(spread)
     number = np.zeros(count)
-    depth = np.nan_to_num(depth_mm, nan=-99.0)
-    for step in [*range(-REACH, 0), *range(1, REACH + 1)]:
-        other = np.arange(count) + step
-        ok = (other >= 0) & (other < count)
-        other = np.clip(other, 0, count - 1)
-        ok &= runs[other] == runs
-        near = np.exp(-0.5 * ((depth[:, :, None] - depth[other][:, None, :]) / SAME_MM) ** 2)
-        support += np.where(ok[:, None], (near * chance[other][:, None, :]).sum(axis=2), 0.0)
-        number += ok
-    return support / np.maximum(number, 1)[:, None], (number > 0).astype(float)
+    for step in range(1, min(REACH, count - 1) + 1):
+        same = (runs[step:] == runs[:-step]).astype(np.float32)
+        support[step:] += spread[:-step] * same[:, None]
+        support[:-step] += spread[step:] * same[:, None]
+        number[step:] += same
+        number[:-step] += same
+    taken = np.take_along_axis(support, np.clip(bins, 0, None), axis=1) / np.maximum(number, 1)[:, None]
+    return np.where(bins >= 0, taken, 0.0), (number > 0).astype(float)
 
 
-def static_share(depth_mm: Array, spots: Array) -> Array:
+def contact(amplitude: Array) -> Array:
+    """The forerun echo's level over its median in the recording, in units of 10 dB: it is strongest in air."""
+    seen = amplitude > 0
+    if seen.sum() < LEAST_FOR_SHARED:
+        return np.zeros(len(amplitude))
+    middle = float(np.median(amplitude[seen]))
+    return np.where(seen, np.clip(DECIBEL * np.log(np.where(seen, amplitude, middle) / middle) / 10, -3, 3), 0.0)
+
+
+def static_share(depth_mm: Array, spots: npt.NDArray[np.int64]) -> Array:
     """Share of the other places on the head that show an echo at this very depth: an artefact does, bone does not."""
     bins = np.nan_to_num(np.floor(depth_mm / 0.2), nan=-1).astype(np.int64)
     top = max(int(bins.max(initial=0)) + 2, 2)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Recording
 
-from ModuleUltrasoundLib.echo_candidates import Candidates, concatenate, find_candidates, noise_level, take_levels
+from ModuleUltrasoundLib.echo_candidates import Candidates, concatenate, find_candidates, reorder, rough_noise, take_levels
 from ModuleUltrasoundLib.echo_features import line_features
-from ModuleUltrasoundLib.signal_chain import check_acquisition, complex_envelopes, design_band
+from ModuleUltrasoundLib.echo_timing import BEFORE, BEHIND, Complexes
+from ModuleUltrasoundLib.signal_chain import Envelopes, check_acquisition, complex_envelopes, design_band
 from ModuleUltrasoundLib.signal_forerun import Forerun, find_forerun, nominal_skin_s, suppress_multiples
 
-CHUNK = 256  # lines worked on at once: the working set stays in the processor's cache
+KEPT = 3  # candidates of a line whose echo is kept sample by sample
+CHUNK = 128  # lines worked on at once: the working set stays in the processor's cache
 BEHIND_S = 4e-6  # of a line kept behind the deepest bone: what follows an echo speaks for or against it
 
 
@@ -26,10 +29,18 @@ class Found:
     forerun_phases: Array  # (n,) rad; 0 where no forerun echo was found
     features: Array  # (n, K, D)
     depths_mm: Array  # (n, K) at the speed of sound given
+    windows: Complexes  # (n, KEPT, W) complex envelope around the first candidates, for the time of flight
+    rate_hz: float
+    carrier_hz: float
 
 
-def search_lines(recording: Recording, speed_m_s: float, depth_mm: tuple[float, float], several_spots: bool) -> Found:
-    """The candidates of every line with their features.
+Rank = Callable[[Array], Array]  # features (n, K, D) -> scores (n, K)
+
+
+def search_lines(
+    recording: Recording, speed_m_s: float, depth_mm: tuple[float, float], several_spots: bool, rank: Rank | None = None
+) -> Found:
+    """The candidates of every line with their features, in the order of `rank` (else of salience).
 
     `depth_mm` (least, most) is where bone is looked for. `several_spots`: the lines come from several places on the head,
     so that what repeats in all of them is an artefact, and can be subtracted.
@@ -49,23 +60,51 @@ def search_lines(recording: Recording, speed_m_s: float, depth_mm: tuple[float, 
     foreruns: list[Forerun] = []
     phases: list[Array] = []
     features: list[Array] = []
+    windows: list[Complexes] = []
     parts = max(-(-len(recording) // CHUNK), 1)
     for lines in np.array_split(recording.lines, parts):
         envelopes = complex_envelopes(lines, band)
         magnitude = np.abs(envelopes.values)
-        levels = take_levels(magnitude)
-        noise = noise_level(levels)
-        forerun = find_forerun(envelopes, magnitude, noise, acquisition)
+        forerun = find_forerun(envelopes, magnitude, rough_noise(magnitude), acquisition)
         if several_spots and skin > 0:
-            envelopes = suppress_multiples(envelopes, forerun, acquisition)
-            levels = take_levels(np.abs(envelopes.values))
-        candidates = find_candidates(envelopes, levels, noise, forerun.skin_s, window, acquisition.transducer_hz)
+            suppress_multiples(envelopes, magnitude, forerun, acquisition)
+        levels = take_levels(magnitude)
+        candidates = find_candidates(envelopes, magnitude, levels, forerun.skin_s, window, acquisition.transducer_hz)
+        feature = line_features(candidates, forerun, skin, acquisition.transducer_hz, speed_m_s)
+        if rank is not None:
+            order = np.argsort(-np.where(np.isfinite(candidates.delays_s), rank(feature), -np.inf), axis=1, kind="stable")
+            candidates, feature = reorder(candidates, order), np.take_along_axis(feature, order[..., None], axis=1)
         found.append(candidates)
         foreruns.append(forerun)
-        at = np.rint(forerun.skin_s * envelopes.rate_hz).astype(np.int64)[:, None]
-        angle = np.angle(np.take_along_axis(envelopes.values, np.minimum(at, magnitude.shape[1] - 1), axis=1)[:, 0])
-        phases.append(np.where(forerun.found, angle + 2 * np.pi * envelopes.carrier_hz * forerun.skin_s, 0.0))
-        features.append(line_features(candidates, forerun, skin, acquisition.transducer_hz, speed_m_s))
+        phases.append(_forerun_phases(envelopes, forerun))
+        features.append(feature)
+        windows.append(_cut_windows(envelopes, candidates.delays_s[:, :KEPT] + forerun.skin_s[:, None]))
     candidates = concatenate(found)
-    forerun = Forerun(**{name: np.concatenate([getattr(part, name) for part in foreruns]) for name in Forerun.__dataclass_fields__})
-    return Found(candidates, forerun, np.concatenate(phases), np.concatenate(features), candidates.delays_s * per_s)
+    forerun = Forerun(
+        **{name: np.concatenate([getattr(part, name) for part in foreruns]) for name in Forerun.__dataclass_fields__}
+    )
+    return Found(
+        candidates,
+        forerun,
+        np.concatenate(phases),
+        np.concatenate(features),
+        candidates.delays_s * per_s,
+        np.concatenate(windows),
+        band.rate_hz,
+        band.carrier_hz,
+    )
+
+
+def _forerun_phases(envelopes: Envelopes, forerun: Forerun) -> Array:
+    """Phase of each line's forerun echo at its centre, rad; 0 where none was found."""
+    at = np.rint(forerun.skin_s * envelopes.rate_hz).astype(np.int64)[:, None]
+    values = np.take_along_axis(envelopes.values, np.minimum(at, envelopes.values.shape[1] - 1), axis=1)[:, 0]
+    return np.where(forerun.found, np.angle(values) + 2 * np.pi * envelopes.carrier_hz * forerun.skin_s, 0.0)
+
+
+def _cut_windows(envelopes: Envelopes, times_s: Array) -> Complexes:
+    """Complex envelope (n, KEPT, W) around times (n, KEPT); beyond the line's ends its last sample repeats."""
+    count = times_s.shape[0]
+    centre = np.rint(np.nan_to_num(times_s) * envelopes.rate_hz).astype(np.int64)
+    index = np.clip(centre[..., None] + np.arange(-BEFORE, BEHIND + 1), 0, envelopes.values.shape[1] - 1)
+    return np.asarray(envelopes.values[np.arange(count)[:, None, None], index])

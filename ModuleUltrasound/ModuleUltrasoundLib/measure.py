@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -11,12 +12,16 @@ from CranioNavLib.parameters import Limits, Parameters
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Recording
 
-from ModuleUltrasoundLib.echo_likelihood import Network, probabilities, shared_features
+from ModuleUltrasoundLib.depth import bone_positions, covariances
+from ModuleUltrasoundLib.echo_likelihood import SHARED_NAMES, Network, probabilities, shared_features
 from ModuleUltrasoundLib.echo_search import Found, search_lines
+from ModuleUltrasoundLib.echo_timing import time_echoes
+from ModuleUltrasoundLib.echo_weights import SHARED, SINGLE
 from ModuleUltrasoundLib.measure_points import bone_points as bone_points
+from ModuleUltrasoundLib.quality import CLIPPED_SHARE, TOLERANCE_MM, clipped_share, quality_of, reasons_of, unstable
 
+LEAST_ALTERNATIVE = 0.01  # less probable echoes are not handed on
 SAME_SPOT_MM = 5.0
-GAP_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -55,16 +60,14 @@ class LineMeasurements:
         return len(self.depths_mm)
 
 
-def runs_and_spots(recording: Recording) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], bool]:
-    """Runs of frames that may support each other, spots on the head, and whether there are several spots."""
+def stays(recording: Recording) -> npt.NDArray[np.int64]:
+    """A number (F,) that is the same for consecutive frames from one place on the head."""
     count = len(recording)
-    origins = recording.probe_to_reference[:, :3, 3]
     jump = np.zeros(count, dtype=bool)
     if count > 1:
-        step = np.linalg.norm(np.diff(origins, axis=0), axis=1)
+        step = np.linalg.norm(np.diff(recording.probe_to_reference[:, :3, 3], axis=0), axis=1)
         jump[1:] = (np.nan_to_num(step) > SAME_SPOT_MM) | (np.diff(recording.palpation_points) != 0)
-    runs = np.cumsum(jump)
-    return runs, runs, bool(len(np.unique(runs)) >= 3)
+    return np.cumsum(jump)
 
 
 def measure_lines(recording: Recording, settings: EchoSettings | None = None) -> LineMeasurements:
@@ -76,64 +79,96 @@ def measure_lines(recording: Recording, settings: EchoSettings | None = None) ->
         The recording's header cannot be that of pulse-echo lines.
     """
     settings = settings or EchoSettings()
-    runs, spots, several = runs_and_spots(recording)
-    window = (settings.least_depth_mm, settings.most_depth_mm)
-    found = search_lines(recording, settings.speed_of_sound_m_s, window, several)
-    chance = bone_probabilities(found, runs, spots)
-    return assemble(recording, settings, found, chance)
-
-
-def bone_probabilities(found: Found, runs: Array, spots: Array) -> Array:
-    """Probability (n, K) that each candidate is the bone: first from its line alone, then from the whole recording."""
-    from ModuleUltrasoundLib import echo_weights
-
-    single, both = Network.from_table(echo_weights.SINGLE), Network.from_table(echo_weights.SHARED)
-    scores = single.scores(found.features)
-    shared = shared_features(found.candidates, found.forerun_phases, scores, found.depths_mm, runs, spots)
-    scores = both.scores(np.concatenate([found.features, shared], axis=-1))
-    return probabilities(scores, np.isfinite(found.depths_mm))[0]
-
-
-def assemble(recording: Recording, settings: EchoSettings, found: Found, chance: Array) -> LineMeasurements:
-    """The measurements of a recording whose echoes have been judged."""
-    rows = np.arange(len(chance))
+    runs = stays(recording)
+    single, both = networks()
+    found = search_lines(
+        recording,
+        settings.speed_of_sound_m_s,
+        (settings.least_depth_mm, settings.most_depth_mm),
+        several_spots=bool(runs.max(initial=0) >= 2),
+        rank=single.scores,
+    )
+    shared = shared_features(found, single.scores(found.features), runs)
+    chance, _ = probabilities(both.scores(np.concatenate([found.features, shared], axis=-1)), np.isfinite(found.depths_mm))
     best = chance.argmax(axis=1)
-    depth = found.depths_mm[rows, best]
-    same = np.abs(found.depths_mm - depth[:, None]) < 0.5
-    quality = np.where(np.isfinite(depth), np.where(same, chance, 0.0).sum(axis=1), 0.0)
+    shift_s, sd_s = time_of(found, best, chance, recording.acquisition.transducer_hz)
+    return assemble(recording, settings, found, chance, best, shift_s, sd_s, runs, shared)
+
+
+@lru_cache(maxsize=1)
+def networks() -> tuple[Network, Network]:
+    """The likelihood of a line by itself, and with the recording around it."""
+    return Network.from_table(SINGLE), Network.from_table(SHARED)
+
+
+def time_of(found: Found, best: npt.NDArray[np.int64], chance: Array, transducer_hz: float) -> tuple[Array, Array]:
+    """Correction of each chosen echo's time and its deviation, in seconds.
+
+    An echo that was not among the first of its line has no window kept: its deviation is the bound for a Gaussian pulse.
+    """
+    rows = np.arange(len(best))
+    kept = best < found.windows.shape[1]
+    peaks = np.where(kept, (found.candidates.delays_s + found.forerun.skin_s[:, None])[rows, best], np.nan)
+    windows = found.windows[rows, np.minimum(best, found.windows.shape[1] - 1)]
+    timing, _ = time_echoes(
+        windows, peaks, found.forerun_phases, chance[rows, best], found.rate_hz, found.carrier_hz, transducer_hz
+    )
     snr = 10 ** (found.candidates.snrs_db[rows, best] / 20)
-    sds = np.where(np.isfinite(snr), 0.3 / np.maximum(np.nan_to_num(snr, nan=1.0), 1.0), np.nan)
+    bound = found.candidates.widths_s[rows, best] / np.maximum(snr, 1.0)
+    return np.where(kept, np.nan_to_num(timing.shift_s), 0.0), np.where(kept, np.maximum(timing.sd_s, bound / 2), bound)
+
+
+def assemble(
+    recording: Recording,
+    settings: EchoSettings,
+    found: Found,
+    chance: Array,
+    best: npt.NDArray[np.int64],
+    shift_s: Array,
+    sd_s: Array,
+    runs: npt.NDArray[np.int64],
+    shared: Array,
+) -> LineMeasurements:
+    """The measurements of a recording whose echoes have been judged and timed."""
+    rows, speed = np.arange(len(chance)), settings.speed_of_sound_m_s
+    depth = found.depths_mm[rows, best] + shift_s * 500 * speed
+    sd_mm = sd_s * 500 * speed
+    quality = quality_of(found.depths_mm, best, chance, sd_mm)
     ok = np.array([status == "OK" for status in recording.statuses], dtype=bool)
-    ok &= np.isfinite(recording.probe_to_reference).all(axis=(1, 2))
-    reasons = []
-    for index in range(len(depth)):
-        status = recording.statuses[index]
-        if not ok[index]:
-            reasons.append("pose missing" if status == "MISSING" else f"pose {status.lower().replace('_', ' ')}")
-        elif not np.isfinite(depth[index]):
-            reasons.append("no echo")
-        else:
-            reasons.append("" if quality[index] >= settings.quality_gate else "weak echo")
-    beam = np.where(ok[:, None], recording.probe_to_reference[:, :3, 2], np.nan)
-    origin = np.where(ok[:, None], recording.probe_to_reference[:, :3, 3], np.nan)
-    # the Probe frame starts at the transducer's face: the skin lies one forerun further on
-    position = origin + beam * (recording.acquisition.forerun_length_mm + depth)[:, None]
-    across = (settings.beam_width_mm / 2.3548) ** 2
-    outer = beam[:, :, None] * beam[:, None, :]
-    covariance = (sds**2)[:, None, None] * outer + across * (np.eye(3) - outer)
-    others = np.where(same | (chance < 0.01), np.nan, found.depths_mm)
+    poses = np.where(ok[:, None, None], recording.probe_to_reference, np.nan)
+    positions, beams = bone_positions(poses, depth, recording.acquisition.forerun_length_mm)
+    found_zero = found.forerun.found
+    covariance = covariances(
+        beams, depth, sd_s, recording.acquisition, speed, settings.beam_width_mm, settings.tilt_sd_deg, found_zero
+    )
+    times = found.candidates.delays_s[rows, best] + found.forerun.skin_s
+    clipped = clipped_share(recording, times) > CLIPPED_SHARE
+    good = quality >= settings.quality_gate
+    reasons = reasons_of(
+        recording,
+        quality,
+        settings.quality_gate,
+        clipped,
+        unstable(recording, depth, good, runs),
+        depth,
+        np.nan_to_num(found.candidates.snrs_db, nan=-np.inf).max(axis=1, initial=-np.inf),
+        15 * shared[rows, best, SHARED_NAMES.index("strength")],
+        10 * shared[:, 0, SHARED_NAMES.index("contact")],
+        chance[rows, best],
+    )
+    other = (np.abs(found.depths_mm - depth[:, None]) >= TOLERANCE_MM) & (chance >= LEAST_ALTERNATIVE)
     return LineMeasurements(
         depths_mm=depth,
-        depth_sds_mm=sds,
-        positions_mm=position,
+        depth_sds_mm=sd_mm,
+        positions_mm=positions,
         covariances_mm2=covariance,
-        beam_directions=beam,
+        beam_directions=beams,
         qualities=quality,
         accepted=np.array([reason == "" for reason in reasons], dtype=bool),
-        reasons=tuple(reasons),
-        alternative_depths_mm=others,
-        alternative_probabilities=np.where(np.isfinite(others), chance, np.nan),
+        reasons=reasons,
+        alternative_depths_mm=np.where(other, found.depths_mm, np.nan),
+        alternative_probabilities=np.where(other, chance, np.nan),
         skin_times_s=found.forerun.skin_s,
-        speed_of_sound_m_s=settings.speed_of_sound_m_s,
+        speed_of_sound_m_s=speed,
         speed_of_sound_sd_m_s=settings.speed_of_sound_sd_m_s,
     )

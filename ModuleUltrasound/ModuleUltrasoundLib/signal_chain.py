@@ -19,7 +19,7 @@ Floats = npt.NDArray[np.float32]
 # The pulse's centre lies a little below the transducer's nominal frequency once tissue has taken its upper
 # part; a damped transducer's -6 dB band is 50 to 100 % of it.
 BAND_CENTRE = 0.92  # of the transducer's frequency
-BAND_WIDTH = 0.85  # full width at half amplitude, of the transducer's frequency
+BAND_WIDTH = 0.75  # full width at half amplitude, of the transducer's frequency
 BAND_EDGES = (0.25, 1.9)  # of the transducer's frequency: nothing outside gets through (drift, spikes' upper part)
 OVERSAMPLING = 4.0  # complex samples a cycle of the transducer's frequency
 
@@ -58,16 +58,16 @@ def check_acquisition(acquisition: Acquisition) -> None:
     sampling, centre = acquisition.sampling_hz, acquisition.transducer_hz
     if not (np.isfinite(sampling) and 1e5 <= sampling <= 1e10):
         raise InputError(f"SamplingFrequencyHz is {sampling}; expected the sampling rate in Hz, for example 60000000")
-    if not (np.isfinite(centre) and 1e4 <= centre):
+    if not (np.isfinite(centre) and centre >= 1e4):
         raise InputError(f"TransducerFrequencyHz is {centre}; expected the transducer's frequency in Hz, for example 5000000")
     if centre * 2.0 > sampling:
         raise InputError(
-            f"TransducerFrequencyHz {centre:g} is above half of SamplingFrequencyHz {sampling:g}; the lines cannot hold its echoes"
+            f"TransducerFrequencyHz {centre:g} is above half of SamplingFrequencyHz {sampling:g}; correct the one that is wrong"
         )
     length, speed = acquisition.forerun_length_mm, acquisition.forerun_speed_m_s
     if length < 0 or not np.isfinite(length) or (length > 0 and not 500 <= speed <= 10000):
         raise InputError(
-            f"ForerunLengthMm {length} with ForerunSpeedOfSoundMps {speed}: expected a length in mm and a speed of 500 to 10000 m/s"
+            f"ForerunLengthMm {length} with ForerunSpeedOfSoundMps {speed}: expected a length in mm and 500 to 10000 m/s"
         )
 
 
@@ -80,8 +80,8 @@ def design_band(acquisition: Acquisition, samples: int, until_s: float) -> Band:
     first = max(1, int(np.ceil(BAND_EDGES[0] * centre / step)))
     last = min(padded // 2, int(BAND_EDGES[1] * centre / step))
     frequencies = np.arange(first, last) * step
-    sigma = BAND_WIDTH * centre / 2.3548 * np.sqrt(2.0) / 1.0
-    gain = np.exp(-0.5 * ((frequencies - BAND_CENTRE * centre) / (sigma / np.sqrt(2.0))) ** 2)
+    sigma = BAND_WIDTH * centre / 2.3548
+    gain = np.exp(-0.5 * ((frequencies - BAND_CENTRE * centre) / sigma) ** 2)
     middle = round(BAND_CENTRE * centre / step)
     out_length = int(fft.next_fast_len(max(int(np.ceil(OVERSAMPLING * centre / step)), last - first)))
     return Band(
@@ -105,19 +105,23 @@ def complex_envelopes(lines: npt.NDArray[np.int16], band: Band) -> Envelopes:
     shifted[:, : len(band.gain) - below] = spectrum[:, below:]
     shifted[:, band.out_length - below :] = spectrum[:, :below]
     scale = np.float32(band.out_length / band.padded)
-    values = fft.ifft(shifted, axis=1, overwrite_x=True) * scale
+    shifted *= scale
+    values = fft.ifft(shifted, axis=1, overwrite_x=True)
     keep = min(band.out_length, int(np.ceil(band.length * band.out_length / band.padded)))
     return Envelopes(values=values[:, :keep], rate_hz=band.rate_hz, carrier_hz=band.carrier_hz)
 
 
 def remove_drift(lines: npt.NDArray[np.int16]) -> Floats:
-    """Lines as float32 without their straight-line drift, which is taken from the quiet second half."""
+    """Lines as float32 without their straight-line drift, which is taken from the quiet second half.
+
+    Slower waves are left to the band-pass; only the step between a line's end and its start would pass it.
+    """
     rf = lines.astype(np.float32)
     quarter = max(rf.shape[1] // 4, 1)
     third = rf[:, -2 * quarter : -quarter].mean(axis=1)
     fourth = rf[:, -quarter:].mean(axis=1)
-    slope = (fourth - third) / quarter
-    base = fourth - slope * (rf.shape[1] - quarter / 2)
-    rf -= base[:, None]
-    rf -= slope[:, None] * np.arange(rf.shape[1], dtype=np.float32)
+    slope = (fourth - third) / np.float32(quarter)
+    base = fourth - slope * np.float32(rf.shape[1] - quarter / 2)
+    ramp = np.stack([np.ones(rf.shape[1], dtype=np.float32), np.arange(rf.shape[1], dtype=np.float32)])
+    rf -= np.stack([base, slope], axis=1) @ ramp
     return rf

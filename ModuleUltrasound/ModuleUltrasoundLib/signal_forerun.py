@@ -6,7 +6,7 @@ and the pulse's own delay, because both echoes share the pulse.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -63,41 +63,44 @@ def find_forerun(envelopes: Envelopes, magnitude: npt.NDArray[np.float32], noise
     return Forerun(np.where(found, times, middle), np.where(found, heights, 0.0), found)
 
 
-def suppress_multiples(envelopes: Envelopes, forerun: Forerun, acquisition: Acquisition) -> Envelopes:
-    """Envelopes without the forerun's reverberations, where these can be predicted.
+def suppress_multiples(
+    envelopes: Envelopes, magnitude: npt.NDArray[np.float32], forerun: Forerun, acquisition: Acquisition
+) -> None:
+    """Take the forerun's reverberations out of `envelopes` and `magnitude` (in place), where these can be predicted.
 
     Multiple number m lies at m times the first echo's time and has its shape. Its complex strength relative to the first
     echo is the median over the batch's lines; it is subtracted only if the lines agree on it in phase, so that an echo of
-    tissue that happens to lie there in one line stays.
+    tissue that happens to lie there in one line stays. Only for lines from several places on the head.
     """
     rate, carrier = envelopes.rate_hz, envelopes.carrier_hz
-    count, length = envelopes.values.shape
     half = int(PULSE_CYCLES / acquisition.transducer_hz * rate)
     lines = np.flatnonzero(forerun.found)
-    if len(lines) < LEAST_LINES or not len(lines):
-        return envelopes
-    nominal = nominal_skin_s(acquisition)
+    if len(lines) < LEAST_LINES:
+        return
     window = np.arange(-half, half + 1)
     first = np.rint(forerun.skin_s[lines] * rate).astype(np.int64)
-    values = envelopes.values.copy()
+    rows, values = lines[:, None], envelopes.values
+    reach = int(SEARCH_S * rate)
+    if first.min() < half:
+        return
+    pulse = values[rows, first[:, None] + window]
+    power = (np.abs(pulse) ** 2).sum(axis=1)
     for number in range(2, MULTIPLES + 1):
         # the first echo's centre stands at the nominal time plus the pulse's delay, which the multiple carries once only
         lag = np.rint(forerun.skin_s[lines] * (number - 1) * rate).astype(np.int64)
-        if (first + lag).max() + half + 1 >= length or nominal == 0:
+        if (first + lag).max() + half + 1 >= envelopes.values.shape[1]:
             break
-        rows = lines[:, None]
-        pulse = envelopes.values[rows, first[:, None] + window]
-        there = values[rows, (first + lag)[:, None] + window]
-        best = _best_shift(values, rows, first + lag, pulse, window, int(SEARCH_S * rate))
-        there = values[rows, (first + lag + best)[:, None] + window]
-        turn = np.exp(-2j * np.pi * carrier * (lag + best) / rate)  # the carrier's phase between the two places
-        strength = (there * pulse.conj()).sum(axis=1) / (np.abs(pulse) ** 2).sum(axis=1) / turn
+        lag += _best_shift(values, rows, first + lag, pulse, window, reach)
+        place = (first + lag)[:, None] + window
+        turn = np.exp(-2j * np.pi * carrier * lag / rate)  # the carrier's phase between the two places
+        strength = (values[rows, place] * pulse.conj()).sum(axis=1) / power / turn
         typical = complex(np.median(strength.real), np.median(strength.imag))
         coherence = np.abs(np.mean(strength / (np.abs(strength) + 1e-12)))
-        if coherence < LEAST_COHERENCE:
+        if coherence < LEAST_COHERENCE or abs(typical) > 1:
             continue
-        values[rows, (first + lag + best)[:, None] + window] -= (typical * turn)[:, None] * pulse
-    return replace(envelopes, values=values)
+        cleaned = values[rows, place] - (typical * turn).astype(np.complex64)[:, None] * pulse
+        values[rows, place] = cleaned
+        magnitude[rows, place] = np.abs(cleaned)
 
 
 def _best_shift(
@@ -108,10 +111,11 @@ def _best_shift(
     window: npt.NDArray[np.int64],
     reach: int,
 ) -> int:
-    """The shift (samples) common to all lines at which the pulse fits best; it takes up the pulse's delay."""
-    scores = []
+    """The shift (samples, at most 0) common to all lines at which the pulse fits best; it takes up the pulse's delay."""
     shifts = range(-reach, 1)
-    for shift in shifts:
-        index = np.clip(starts[:, None] + shift + window, 0, values.shape[1] - 1)
-        scores.append(float(np.abs((values[rows, index] * pulse.conj()).sum(axis=1)).mean()))
+    some = slice(None, None, max(len(starts) // 32, 1))  # the shift is the pulse's: a few lines tell it
+    wide = np.arange(window[0] - reach, window[-1] + 1)
+    there = values[rows[some], np.clip(starts[some, None] + wide, 0, values.shape[1] - 1)]
+    size = len(window)
+    scores = [np.abs((there[:, reach + s : reach + s + size] * pulse[some].conj()).sum(axis=1)).mean() for s in shifts]
     return int(shifts[int(np.argmax(scores))])

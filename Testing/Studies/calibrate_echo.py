@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from ModuleUltrasoundLib.echo_likelihood import Network, shared_features
 from ModuleUltrasoundLib.echo_search import Found, search_lines
-from ModuleUltrasoundLib.measure import runs_and_spots
+from ModuleUltrasoundLib.measure import stays
 
 from Testing.Studies.echo_lines import simulate
 
@@ -33,8 +33,7 @@ class World:
 
     found: Found
     labels: npt.NDArray[np.int64]  # (n,) index of the right candidate; K: none
-    runs: Array
-    spots: Array
+    runs: npt.NDArray[np.int64]
     true_mm: Array
 
 
@@ -43,16 +42,16 @@ def make_world(seed: int) -> World:
     rng = np.random.default_rng(seed)
     frames = int(rng.choice([1, 5, 20, 40, 80], p=[0.15, 0.15, 0.25, 0.25, 0.2]))
     recording, truth, world = simulate(rng, frames, without_bone=float(rng.choice([0.05, 0.25, 0.6])))
-    runs, spots, several = runs_and_spots(recording)
+    runs = stays(recording)
     assumed = world.speed_m_s if rng.random() < 0.7 else float(rng.uniform(1450, 1630))
-    found = search_lines(recording, assumed, (1.0, 20.0), several)
+    found = search_lines(recording, assumed, (1.0, 20.0), bool(runs.max(initial=0) >= 2))
     true = truth.depth_mm * assumed / world.speed_m_s
     off = np.abs(found.depths_mm - true[:, None])
     off = np.where(np.isfinite(off), off, np.inf)
     # the strongest candidate within the tolerance stands for the bone
     level = np.where(off < RIGHT_MM * 0.8, found.candidates.snrs_db, -np.inf)
     labels = np.where(np.isfinite(level).any(axis=1), level.argmax(axis=1), off.shape[1])
-    return World(found, labels, runs, spots, true)
+    return World(found, labels, runs, true)
 
 
 def fit(features: Array, valid: Array, labels: npt.NDArray[np.int64], rng: np.random.Generator, epochs: int) -> Network:
@@ -108,9 +107,7 @@ def _gradients(weights: list[Array], biases: list[Array], x: Array, valid: Array
 def shared_of(world: World, single: Network) -> Array:
     """The features of the second stage: the line's own and the recording's."""
     scores = single.scores(world.found.features)
-    shared = shared_features(
-        world.found.candidates, world.found.forerun_phases, scores, world.found.depths_mm, world.runs, world.spots
-    )
+    shared = shared_features(world.found, scores, world.runs)
     return np.concatenate([world.found.features, shared], axis=-1)
 
 

@@ -60,6 +60,7 @@ class World:
     ringing: float
     ringing_s: float
     spikes: float  # a line
+    noise_band: float  # upper edge of the receiver's band over the transducer's frequency; 0: white noise
     drift: float
     offset: float
     full_scale: float
@@ -112,14 +113,15 @@ def draw_world(rng: np.random.Generator, frames_a_point: int | None = None) -> W
         tilt_width_deg=rng.uniform(1.2, 6),
         tilt_floor=10 ** (-rng.uniform(12, 30) / 20),
         speckle_db=rng.choice([rng.uniform(20, 50), 90.0], p=[0.8, 0.2]),
-        speckle_per_us=rng.uniform(2, 12),
-        galea_db=(a := rng.uniform(6, 22), a + rng.uniform(0, 10)),
+        speckle_per_us=rng.uniform(2, 8),
+        galea_db=(a := rng.uniform(8, 24), a + rng.uniform(0, 10)),
         layers=int(rng.integers(0, 4)),
         inner_db=rng.uniform(5, 25) if rng.random() < 0.8 else 99.0,
         bone_mm=rng.uniform(2.5, 9),
         ringing=rng.uniform(0, 3) * (rng.random() < 0.8),
         ringing_s=rng.uniform(0.1, 0.4) * 1e-6,
         spikes=rng.choice([0.0, rng.uniform(0, 1.5)]),
+        noise_band=rng.uniform(1.8, 3.5) if rng.random() < 0.25 else 0.0,
         drift=rng.uniform(0, 0.5) * (rng.random() < 0.4),
         offset=rng.uniform(-1, 1) * (rng.random() < 0.4),
         full_scale=rng.uniform(0.3, 1.2),
@@ -263,10 +265,22 @@ def _line(
     rf = _synthesise(world, np.array(times), np.array(amplitudes), np.array(paths))
     clock = np.arange(world.samples) / acquisition.sampling_hz
     rf += world.ringing * np.exp(-clock / world.ringing_s) * np.cos(2 * np.pi * acquisition.transducer_hz * clock + world.phase)
-    rf += rng.normal(0, noise, world.samples)
+    rf += _noise(rng, world) * noise
     for _ in range(rng.poisson(world.spikes)):
         rf[rng.integers(world.samples)] += rng.choice([-1, 1]) * rng.uniform(5, 40) * noise
     return rf + noise * 30 * (world.offset + world.drift * np.sin(2 * np.pi * (clock * rng.uniform(1e4, 6e4) + rng.random())))
+
+
+def _noise(rng: np.random.Generator, world: World) -> Array:
+    """Noise of unit standard deviation, white or limited to the receiver's band."""
+    white = rng.normal(size=world.samples)
+    edge = world.noise_band * world.acquisition.transducer_hz
+    if edge <= 0 or edge >= world.acquisition.sampling_hz / 2:
+        return white
+    spectrum = np.fft.rfft(white)
+    spectrum[np.fft.rfftfreq(world.samples, 1 / world.acquisition.sampling_hz) > edge] = 0
+    limited = np.fft.irfft(spectrum, world.samples)
+    return np.asarray(limited / limited.std())
 
 
 def _synthesise(world: World, times: Array, amplitudes: Array, paths: Array) -> Array:
@@ -275,7 +289,7 @@ def _synthesise(world: World, times: Array, amplitudes: Array, paths: Array) -> 
     rf = np.zeros(world.samples)
     if not len(times):
         return rf
-    width = 4.5e-6 * 3e6 / acquisition.transducer_hz
+    width = (5.5 if world.pulse in ("gauss", "ricker") else 12.0) / acquisition.transducer_hz
     wave, rate = make_pulse(world, width)
     clock = np.arange(int(2 * width * acquisition.sampling_hz) + 1)
     centre = acquisition.transducer_hz
