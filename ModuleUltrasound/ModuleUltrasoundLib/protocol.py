@@ -33,7 +33,7 @@ PAIRS = {
     "Periorbital 1": (20.0, 11.0),  # above the supraorbital rim
     "Periorbital 2": (36.0, -21.0),  # body of the zygoma, below and beside the orbit
 }
-WINDOW_RADII_DEG = (9.0, 15.0, 22.0)  # tried in turn: a window that holds a defect or a clamp is widened
+WINDOW_RADII_DEG = (12.0, 17.0, 23.0)  # tried in turn: a window that holds a defect or a clamp is widened
 GRID_STEP_DEG = 1.8
 
 PROBE_FACE_RADIUS_MM = 2.5  # 5 mm element
@@ -43,7 +43,9 @@ LARGEST_STEP_MM = 2.5  # of the bone under the probe's body
 LARGEST_ROUGHNESS_MM = 0.45  # RMS from the plane through the bone under the body
 SMALLEST_SPACING_MM = 20.0
 ADULT_LENGTH_MM = 178.0  # nasion to opisthocranion, where the CT does not reach the back of the head
-LATERAL_SD_MM = 0.6  # of a bone point along the surface normal: one value for all, only ratios matter here
+NORMAL_SD_MM = 0.6  # of a bone point along the surface normal: one value for all, only ratios matter here
+HEAD_RADIUS_MM = 75.0
+ROUGHNESS_WEIGHT = 0.05  # mm^2 of predicted error that an ideal place is worth against one at a window's rim
 PRIOR_SD_MM = 3.0  # landmark registration, per axis; keeps the information regular with few points
 
 
@@ -276,27 +278,23 @@ def _fit_planes(offsets: Array, heights: Array) -> tuple[Array, Array]:
     return slopes, roughness
 
 
-def _information(spot: _Spot, center: Array) -> Array:
-    """What a point tells of a small motion (rotation rad about `center`, translation mm): (6, 6)."""
-    row = np.concatenate([np.cross(spot.position - center, spot.normal), spot.normal])
-    information: Array = np.outer(row, row) / LATERAL_SD_MM**2
-    return information
+def _rows(spots: Sequence[_Spot], center: Array) -> Array:
+    """How each point's distance to the bone changes with a small motion (rotation about `center`, translation): (M, 6)."""
+    positions, normals = (np.array([getattr(spot, name) for spot in spots]) for name in ("position", "normal"))
+    rows: Array = np.concatenate([np.cross(positions - center, normals), normals], axis=1) / NORMAL_SD_MM
+    return rows
 
 
 def _choose(windows: dict[tuple[str, int], list[_Spot]], center: Array) -> dict[tuple[str, int], _Spot]:
-    """One spot a window, so that the summed squared error over the head is least; both sides alike where they can be."""
+    """One spot a window, so that the mean squared error over the head is least; both sides alike where they can be."""
     chosen = {key: min(spots, key=lambda spot: spot.penalty) for key, spots in windows.items()}
-    arms = 75.0 * np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))])  # targets all round the middle
-    prior = np.diag([(75.0 / PRIOR_SD_MM) ** 2] * 3 + [1.0 / PRIOR_SD_MM**2] * 3)
-    for _ in range(3):
+    pairings = {name: _pairings(windows[name, -1], windows[name, 1]) for name in PAIRS}
+    for _ in range(4):
         before = dict(chosen)
         for name in PAIRS:
-            others = {key: spot for key, spot in chosen.items() if key[0] != name}
-            base = prior + sum((_information(spot, center) for spot in others.values()), np.zeros((6, 6)))
-            chosen[name, -1], chosen[name, 1] = min(
-                _pairings(windows[name, -1], windows[name, 1]),
-                key=lambda pair: _cost(pair, others, base, arms, center),
-            )
+            others = [spot for key, spot in chosen.items() if key[0] != name]
+            best = int(np.argmin(_costs(pairings[name], others, center)))
+            chosen[name, -1], chosen[name, 1] = pairings[name][best]
         if all(before[key] is chosen[key] for key in chosen):
             break
     return chosen
@@ -312,16 +310,26 @@ def _pairings(left: list[_Spot], right: list[_Spot]) -> list[tuple[_Spot, _Spot]
     return mirrored + [(a, b) for a in best_left for b in best_right]
 
 
-def _cost(pair: tuple[_Spot, _Spot], others: dict[tuple[str, int], _Spot], base: Array, arms: Array, center: Array) -> float:
-    """Predicted mean squared error (mm^2) over the arms' ends, plus penalties for crowding and rough places."""
-    covariance = np.linalg.inv(base + _information(pair[0], center) + _information(pair[1], center))
-    squared = 0.0
-    for arm in arms:
-        cross = np.array([[0, arm[2], -arm[1]], [-arm[2], 0, arm[0]], [arm[1], -arm[0], 0]])
-        motion = np.concatenate([cross, np.eye(3)], axis=1)
-        squared += float(np.trace(motion @ covariance @ motion.T)) / len(arms)
-    places = np.array([spot.position for spot in (*others.values(), *pair)])
-    gaps = np.linalg.norm(places[None, -2:] - places[:-1, None], axis=2)
-    gaps[-1, 0] = np.inf  # to itself
-    crowding = float(np.clip(SMALLEST_SPACING_MM - gaps, 0.0, None).sum() / SMALLEST_SPACING_MM)
-    return squared * (1.0 + 2.0 * crowding) + 0.05 * (pair[0].penalty + pair[1].penalty)
+def _costs(pairs: list[tuple[_Spot, _Spot]], others: list[_Spot], center: Array) -> Array:
+    """(K,) predicted mean squared error (mm^2) over targets all round the head, raised for crowding and rough places."""
+    known = _rows(others, center)
+    prior = np.diag([(HEAD_RADIUS_MM / PRIOR_SD_MM) ** 2] * 3 + [1.0 / PRIOR_SD_MM**2] * 3)
+    first, second = (_rows([pair[side] for pair in pairs], center) for side in (0, 1))
+    information = known.T @ known + prior + _outer(first) + _outer(second)
+    # targets at both ends of three axes and in the middle: four of the seven lie off each axis of rotation
+    spread = np.array([4 / 7 * HEAD_RADIUS_MM**2] * 3 + [1.0] * 3)
+    squared = (np.linalg.inv(information).diagonal(axis1=1, axis2=2) * spread).sum(axis=1)
+    places = np.array([spot.position for spot in others])
+    ends = np.array([[spot.position for spot in pair] for pair in pairs])  # (K, 2, 3)
+    gaps = np.linalg.norm(ends[:, :, None] - places[None, None], axis=3).reshape(len(pairs), -1)
+    between = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+    gaps = np.concatenate([gaps, between[:, None]], axis=1)
+    crowding = np.clip(SMALLEST_SPACING_MM - gaps, 0.0, None).sum(axis=1) / SMALLEST_SPACING_MM
+    rough = np.array([pair[0].penalty + pair[1].penalty for pair in pairs])
+    costs: Array = squared * (1.0 + 2.0 * crowding) + ROUGHNESS_WEIGHT * rough
+    return costs
+
+
+def _outer(rows: Array) -> Array:
+    """(K, 6, 6) from rows (K, 6)."""
+    return np.asarray(rows[:, :, None] * rows[:, None, :])

@@ -1,0 +1,152 @@
+"""The 18 points: in their regions, on bone, where a probe can stand, and together holding all six degrees of freedom."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from CranioNavLib.errors import InputError
+from CranioNavLib.rigid import invert_rigid, rigid_from_vector, transform_directions, transform_points
+from CranioNavLib.surface import Surface
+from ModuleUltrasoundLib.protocol import LANDMARK_LABELS, REGIONS, plan_protocol, probe_footprint
+
+COUNTS = {"Left lateral": 3, "Right lateral": 3, "Frontal convexity": 4, "Forehead": 4, "Periorbital": 4}
+# Nasion at the origin of the head built below
+LANDMARKS = np.array([[0.0, 0.0, 0.0], [-48.0, -14.0, 2.0], [48.0, -14.0, 2.0], [0.0, 2.0, -48.0]])
+
+
+def a_head(keep=None) -> Surface:
+    """An egg 140 x 180 x 150 mm with its nasion at the origin; `keep` picks triangles by their middles."""
+    theta, phi = np.meshgrid(np.linspace(0.02, np.pi - 0.02, 120), np.linspace(0, 2 * np.pi, 240, endpoint=False), indexing="ij")
+    vertices = np.stack(
+        [
+            70 * np.sin(theta) * np.cos(phi) * (1 - 0.1 * np.sin(theta) * np.sin(phi)),
+            90 * np.sin(theta) * np.sin(phi) - 88.0,
+            75 * np.cos(theta) + 15.0,
+        ],
+        axis=-1,
+    )
+    rows, columns = theta.shape
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b = index[:-1], index[1:]
+    c, d = np.roll(b, -1, axis=1), np.roll(a, -1, axis=1)
+    triangles = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    flat = vertices.reshape(-1, 3)
+    if keep is not None:
+        triangles = triangles[keep(flat[triangles].mean(axis=1))]
+    return Surface(flat, triangles)
+
+
+@pytest.fixture(scope="module")
+def a_skull() -> Surface:
+    return a_head()
+
+
+def test_there_are_18_points_with_the_counts_of_the_chapter(a_skull):
+    plan = plan_protocol(a_skull, LANDMARKS, LANDMARK_LABELS)
+    assert len(plan) == 18
+    assert {region: plan.regions.count(region) for region in REGIONS} == COUNTS
+    assert len(set(plan.labels)) == 18
+    assert all(label.startswith(region) for label, region in zip(plan.labels, plan.regions))
+
+
+def test_points_lie_on_the_surface_with_outward_unit_normals(a_skull):
+    plan = plan_protocol(a_skull, LANDMARKS)
+    found = a_skull.closest(plan.positions_ras_mm)
+    assert found.distances_mm.max() < 0.01
+    assert np.linalg.norm(plan.normals, axis=1) == pytest.approx(1.0)
+    assert np.degrees(np.arccos(np.sum(plan.normals * found.normals, axis=1))).max() < 4.0
+
+
+def test_regions_are_where_their_names_say(a_skull):
+    plan = plan_protocol(a_skull, LANDMARKS)
+    by_region = {region: plan.positions_ras_mm[[r == region for r in plan.regions]] for region in REGIONS}
+    assert (by_region["Left lateral"][:, 0] < -40).all()
+    assert (by_region["Right lateral"][:, 0] > 40).all()
+    assert (by_region["Frontal convexity"][:, 2] > 50).all()
+    assert by_region["Forehead"][:, 2].min() > by_region["Periorbital"][:, 2].min()
+    assert (by_region["Forehead"][:, 1] > -60).all()
+    assert (by_region["Periorbital"][:, 1] > -45).all()
+    assert by_region["Periorbital"][:, 2].max() < by_region["Frontal convexity"][:, 2].min()
+
+
+def test_both_sides_are_alike_on_a_symmetric_head(a_skull):
+    plan = plan_protocol(a_skull, LANDMARKS)
+    mirrored = plan.positions_ras_mm * (-1, 1, 1)
+    gaps = np.linalg.norm(mirrored[:, None] - plan.positions_ras_mm[None], axis=2).min(axis=1)
+    assert gaps.max() < 6.0
+
+
+def test_points_keep_apart(a_skull):
+    places = plan_protocol(a_skull, LANDMARKS).positions_ras_mm
+    gaps = np.linalg.norm(places[:, None] - places[None], axis=2) + 1e3 * np.eye(18)
+    assert gaps.min() > 15.0
+
+
+def test_landmarks_turn_the_plan_with_the_head(a_skull):
+    pose = rigid_from_vector([0.3, -0.5, 1.2], [40.0, -300.0, 900.0])
+    turned = Surface(transform_points(pose, a_skull.vertices_mm), a_skull.triangles)
+    here = plan_protocol(a_skull, LANDMARKS, LANDMARK_LABELS)
+    there = plan_protocol(turned, transform_points(pose, LANDMARKS)[::-1], LANDMARK_LABELS[::-1])
+    assert there.head_to_ras == pytest.approx(pose @ here.head_to_ras, abs=1e-6)
+    # between places that serve equally well the last digit of the ray casts decides
+    back = transform_points(invert_rigid(pose), there.positions_ras_mm)
+    assert np.linalg.norm(back - here.positions_ras_mm, axis=1).max() < 10.0
+    assert np.sum(there.normals * transform_directions(pose, here.normals), axis=1).min() > np.cos(np.radians(10.0))
+
+
+def test_without_landmarks_the_shape_gives_a_plan_near_the_same(a_skull):
+    plan = plan_protocol(a_skull)
+    assert len(plan) == 18
+    assert np.linalg.norm(plan.head_to_ras[:3, 3]) < 25.0
+    assert (plan.positions_ras_mm[[r == "Right lateral" for r in plan.regions], 0] > 40).all()
+
+
+def test_unknown_landmark_names_fall_back_on_the_shape(a_skull):
+    assert np.allclose(plan_protocol(a_skull, LANDMARKS, list("abcd")).head_to_ras, plan_protocol(a_skull).head_to_ras)
+
+
+def test_a_hole_in_the_bone_is_kept_clear_of():
+    hole = np.array([28.0, -12.0, 42.0])
+    skull = a_head(lambda middles: np.linalg.norm(middles - hole, axis=1) > 22.0)
+    plan = plan_protocol(skull, LANDMARKS)
+    assert np.linalg.norm(plan.positions_ras_mm - hole, axis=1).min() > 22.0 + 5.0
+
+
+def test_an_open_face_without_the_back_of_the_head_is_enough():
+    plan = plan_protocol(a_head(lambda middles: middles[:, 1] > -150.0), LANDMARKS)
+    assert len(plan) == 18
+
+
+def test_missing_bone_is_refused_by_the_name_of_its_region():
+    with pytest.raises(InputError, match=r"no place for the probe at left lateral 3"):
+        plan_protocol(a_head(lambda middles: middles[:, 2] < 30.0), LANDMARKS)
+
+
+def test_landmarks_that_span_no_face_are_refused(a_skull):
+    with pytest.raises(InputError, match="check their labels and their unit"):
+        plan_protocol(a_skull, LANDMARKS / 1000.0, LANDMARK_LABELS)
+    with pytest.raises(InputError, match="got 4 landmarks and 3 labels"):
+        plan_protocol(a_skull, LANDMARKS, LANDMARK_LABELS[:3])
+
+
+def test_all_six_degrees_of_freedom_are_held(a_skull):
+    """No small motion of the head, turned about its middle or shifted, leaves all points where they are on the bone."""
+    plan = plan_protocol(a_skull, LANDMARKS)
+    center = np.array([0.0, -85.0, 10.0])
+    rows = np.concatenate([np.cross(plan.positions_ras_mm - center, plan.normals) / 75.0, plan.normals], axis=1)
+    assert np.linalg.svd(rows, compute_uv=False).min() > 0.2
+
+
+def test_a_probe_cannot_stand_at_an_edge_or_on_a_step():
+    grid = np.arange(-40.0, 40.5, 1.0)
+    x, y = np.meshgrid(grid, grid, indexing="ij")
+    z = np.where(x > 20.0, 3.0, 0.0)  # a step at x = 20
+    index = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    triangles = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    plate = Surface(np.column_stack([x.ravel(), y.ravel(), z.ravel()]), triangles)
+    places = np.array([[0.2, 0.1, 0.0], [18.0, 0.0, 0.0], [-37.0, 0.0, 0.0], [0.0, 30.0, 0.0]])
+    leaning = np.array([0.1, 0.1, 1.0]) / np.linalg.norm([0.1, 0.1, 1.0])
+    _, normals, _, good = probe_footprint(plate, places, np.tile(leaning, (4, 1)))
+    assert good.tolist() == [True, False, False, True]
+    assert normals[0] == pytest.approx([0.0, 0.0, 1.0], abs=1e-4)
