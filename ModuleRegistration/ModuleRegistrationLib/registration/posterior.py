@@ -1,0 +1,110 @@
+"""Mean and covariance of the pose over its posterior, by importance sampling around the minima of the search.
+
+With 18 points on a rough surface the likelihood is no paraboloid: its curvature at the best minimum promises too
+much, and neighbouring minima share the probability. Samples weighted by the posterior see both, and give each
+minimum its probability.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from CranioNavLib.rigid import Array, invert_rigid, rigid_from_vector
+from scipy.spatial.transform import Rotation
+from scipy.special import logsumexp
+
+from ModuleRegistrationLib.registration.likelihood import PARAMETERS, Model, State, evaluate
+
+PROPOSAL_FREEDOM = 5.0  # tails of the proposal: heavier than the posterior's
+PROPOSAL_STRETCH = 1.3  # its width beside the curvature's
+LOG_SCALE_SD = 0.35  # of the proposal for the common factor on the variances
+LEAST_SHARE = 0.08  # of the samples that each minimum gets
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Moments over the weighted samples, as a motion after the initial registration."""
+
+    motion: Array  # (4, 4) mean
+    covariance: Array  # (6, 6) about the model's pivot, second moment about `motion`
+    offset_mm: float
+    speed: float
+    speed_sd: float
+    probabilities: Array  # (K,) of the minima
+    effective_samples: float
+
+
+def motion_vector(motion: Array, pivot: Array) -> Array:
+    """(..., 6) rotation vector about the pivot and translation of motions (..., 4, 4); inverse of rigid_from_vector."""
+    turn = Rotation.from_matrix(motion[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*motion.shape[:-2], 3)
+    shift = motion[..., :3, 3] + motion[..., :3, :3] @ pivot - pivot
+    return np.concatenate([turn, shift], axis=-1)
+
+
+def sample_posterior(
+    model: Model, minima: State, covariances: Array, scores: Array, count: int, rng: np.random.Generator
+) -> Posterior:
+    """Weigh `count` samples drawn around `minima`, the best first.
+
+    Parameters
+    ----------
+    minima : State of K poses
+    covariances : ndarray, shape (K, 8, 8)
+        Inverse Hessians there.
+    scores : ndarray, shape (K,)
+        Negative log evidence of each, which divides the samples between them.
+    """
+    size = covariances.shape[-1] if model.speed_sd > 0 else covariances.shape[-1] - 1  # a known speed is not drawn
+    share = np.maximum(np.exp(scores.min() - scores), LEAST_SHARE)
+    share = share / share.sum()
+    origin = rng.choice(len(share), size=count, p=share)
+    origin[: len(share)] = np.arange(len(share))
+    roots = np.linalg.cholesky(covariances[:, :size, :size] * PROPOSAL_STRETCH**2)
+    heavy = np.sqrt(PROPOSAL_FREEDOM / rng.chisquare(PROPOSAL_FREEDOM, count))
+    draws = (roots[origin] @ rng.standard_normal((count, size, 1)))[..., 0] * heavy[:, None]
+    state = State(
+        rigid_from_vector(draws[:, :3], draws[:, 3:6], model.pivot) @ minima.motion[origin],
+        minima.offset[origin] + draws[:, 6],
+        minima.speed[origin] + (draws[:, 7] if size == PARAMETERS else 0.0),
+        minima.scale[origin] * np.exp(rng.normal(0, LOG_SCALE_SD, count)),
+        np.full(count, minima.outliers[0]),
+    )
+    proposal = np.stack([_log_density(model, minima, roots, k, state) + np.log(share[k]) for k in range(len(share))])
+    log_weight = -evaluate(model, state).cost - logsumexp(proposal, axis=0)
+    weight = np.exp(log_weight - log_weight.max())
+    weight = np.minimum(weight, weight.mean() * np.sqrt(count))  # truncated: one lucky sample decides nothing
+    weight = weight / weight.sum()
+    return _moments(model, minima, state, weight, np.argmax(proposal, axis=0))
+
+
+def _log_density(model: Model, minima: State, roots: Array, k: int, state: State) -> Array:
+    """Log density of the proposal around minimum k at the samples (S,), up to a common constant."""
+    vector = motion_vector(state.motion @ invert_rigid(minima.motion[k]), model.pivot)
+    apart = np.column_stack([vector, state.offset - minima.offset[k], state.speed - minima.speed[k]])
+    size = roots.shape[-1]
+    white = np.linalg.solve(roots[k], apart[:, :size].T)
+    narrow = np.log(np.diagonal(roots[k])).sum()
+    scale = np.log(state.scale / minima.scale[k]) / LOG_SCALE_SD
+    density: Array = -(PROPOSAL_FREEDOM + size) / 2 * np.log1p((white**2).sum(axis=0) / PROPOSAL_FREEDOM) - narrow - scale**2 / 2
+    return density
+
+
+def _moments(model: Model, minima: State, state: State, weight: Array, nearest: Array) -> Posterior:
+    probabilities = np.bincount(nearest, weight, len(minima.motion))
+    best = int(np.argmax(probabilities))
+    inside = weight * (nearest == best)
+    apart = motion_vector(state.motion @ invert_rigid(minima.motion[best]), model.pivot)
+    mean = inside @ apart / inside.sum()
+    motion = rigid_from_vector(mean[:3], mean[3:], model.pivot) @ minima.motion[best]
+    left = motion_vector(state.motion @ invert_rigid(motion), model.pivot)
+    speed = float(weight @ state.speed)
+    return Posterior(
+        motion=motion,
+        covariance=(weight[:, None] * left).T @ left,
+        offset_mm=float(weight @ state.offset),
+        speed=speed,
+        speed_sd=float(np.sqrt(weight @ (state.speed - speed) ** 2)),
+        probabilities=probabilities,
+        effective_samples=float(1 / np.sum(weight**2)),
+    )
