@@ -28,10 +28,13 @@ class ParametersInScene(Generic[P]):
             node.SetAttribute(scene.ROLE_ATTRIBUTE, self.sessionRole)
         return ParameterNode(node, self.parameterClass)
 
+    def pluginSettings(self, kind: str, name: str) -> ParameterNode[Parameters]:
+        """The door to the settings that the scene keeps for a plugin."""
+        return ParameterNode(self.parameters().node, KINDS[kind].find(name).Settings, settings_prefix(kind, name))
+
     def createPlugin(self, kind: str, name: str) -> Any:
         """A plugin of a kind with the settings that the scene keeps for it."""
-        plugin = KINDS[kind].find(name)
-        return plugin(ParameterNode(self.parameters().node, plugin.Settings, settings_prefix(kind, name)).read())
+        return KINDS[kind].find(name)(self.pluginSettings(kind, name).read())
 
 
 def describeModule(parent: Any, title: str, panel: Panel, dependencies: list[str]) -> None:

@@ -6,6 +6,7 @@ Only setters and `property(name)` are used, which PythonQt and PySide6 spell ali
 from __future__ import annotations
 
 import importlib
+import logging
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from enum import Enum
@@ -18,6 +19,7 @@ from CranioNavLib import host
 from CranioNavLib.errors import InputError
 from CranioNavLib.parameters import ParameterInfo
 
+LOG = logging.getLogger(__name__)
 NO_LIMIT = 1e6
 POLL_MS = 50
 
@@ -46,6 +48,31 @@ def connect(widget: Any, signal: str, slot: Callable[..., Any]) -> None:
         widget.connect(signal, slot)
     else:
         getattr(widget, signal.partition("(")[0]).connect(slot)
+
+
+class Ticker:
+    """Calls a function again and again from the event loop: how samples of a device's thread reach the scene."""
+
+    def __init__(self, parent: Any, interval_ms: int, work: Callable[[], object]) -> None:
+        self._work, self._timer = work, toolkit().QTimer(parent)
+        self._timer.setInterval(interval_ms)
+        connect(self._timer, "timeout()", self._tick)
+
+    def start(self) -> None:
+        """Begin; may be called twice."""
+        self._timer.start()
+
+    def stop(self) -> None:
+        """End; may be called twice."""
+        self._timer.stop()
+
+    def _tick(self) -> None:
+        if host.in_application():
+            sleep(0.001)  # the application's event loop holds the interpreter: the device's thread runs in pauses like this
+        try:
+            self._work()
+        except InputError:
+            LOG.exception("refused while polling")  # the panel's read-outs say so, too
 
 
 class ThreadRunner:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,17 @@ from CranioNavLib.surface import Surface
 from CranioNavLib.volume import Volume
 
 SPEED, SPEED_SD = "CranioNav.SpeedOfSoundMps", "CranioNav.SpeedOfSoundSdMps"
+POSE_STATUS, POSE_TIME = "CranioNav.PoseStatus", "CranioNav.PoseTimeS"  # on the transforms of tracked tools
 AXES = "xyz"
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePose:
+    """What a tool's transform in the scene says. Without a trustworthy pose there is no matrix."""
+
+    matrix: Array | None  # (4, 4) mm; None unless the status is OK
+    status: str  # the words of PLUS: OK, MISSING, INVALID...; MISSING before the first pose
+    host_time_s: float  # time.monotonic() of this computer when the pose was taken; NaN before the first
 
 
 def set_points(role: str, points: LabelledPoints) -> Any:
@@ -65,6 +76,30 @@ def get_transform(role: str) -> Array:
         There is no such node, or the user replaced its matrix by one that is not rigid.
     """
     return check_rigid(host.slicer_package().util.arrayFromTransformMatrix(_node(role)), f"{role} in the scene")
+
+
+def set_pose(role: str, matrix: npt.ArrayLike | None, status: str, host_time_s: float) -> Any:
+    """Write a tracked tool's pose, or (matrix None) that it has none now. Observers hear of it once.
+
+    A lost tool keeps its old matrix in the node, as MRML has no transform without one: `get_pose` does not give it
+    away, and what is drawn under the node has to be hidden while the status is not OK.
+    """
+    host.check_thread()
+    node = scene.find_or_create(role)
+    with host.slicer_package().util.NodeModify(node):
+        node.SetAttribute(POSE_STATUS, status if matrix is not None or status != "OK" else "MISSING")
+        node.SetAttribute(POSE_TIME, repr(float(host_time_s)))
+        if matrix is not None:
+            set_transform(role, matrix)
+    return node
+
+
+def get_pose(role: str) -> ScenePose:
+    """What the transform of a tracked tool says now."""
+    node = scene.find(role)
+    status = (node.GetAttribute(POSE_STATUS) if node is not None else None) or "MISSING"
+    taken = node.GetAttribute(POSE_TIME) if node is not None else None
+    return ScenePose(get_transform(role) if status == "OK" else None, status, float(taken) if taken else float("nan"))
 
 
 def set_surface(role: str, surface: Surface) -> Any:

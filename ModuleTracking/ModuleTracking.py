@@ -1,0 +1,464 @@
+"""Tracking as 3D Slicer sees it: module, widget, logic, self-test. Wiring only; the work stands in ModuleTrackingLib."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+_HERE = Path(__file__).resolve().parent
+for _folder in (_HERE, _HERE.parent / "Shared"):
+    # In a source checkout the libraries stand in folders of their own; installed, they stand beside this file.
+    if _folder.is_dir() and str(_folder) not in sys.path:
+        sys.path.append(str(_folder))
+
+from CranioNavLib import scene, scene_data  # noqa: E402
+from CranioNavLib.errors import InputError  # noqa: E402
+from CranioNavLib.host import (  # noqa: E402
+    ScriptedLoadableModule,
+    ScriptedLoadableModuleLogic,
+    ScriptedLoadableModuleTest,
+    ScriptedLoadableModuleWidget,
+    slicer,
+)
+from CranioNavLib.module_logic import ParametersInScene, describeModule  # noqa: E402
+from CranioNavLib.panel import Level, Reading, StepState, StepStatus  # noqa: E402
+from CranioNavLib.panel_model import PanelModel  # noqa: E402
+from ModuleTrackingLib.panel_description import PANEL, PointList, Tool, TrackingParameters  # noqa: E402
+from ModuleTrackingLib.tracker import PoseStatus, TrackerError  # noqa: E402
+
+POLL_MS = 20
+TIP_HISTORY = 4096  # tip positions kept a tool: half a minute at 120 Hz
+LEVELS = {PoseStatus.OK: Level.GOOD, PoseStatus.OUT_OF_VOLUME: Level.WARNING}
+
+
+class ModuleTracking(ScriptedLoadableModule):
+    """What 3D Slicer's module list says."""
+
+    def __init__(self, parent=None):
+        super().__init__(parent)
+        describeModule(self.parent, "CranioNav Tracking", PANEL, [])
+
+
+class ModuleTrackingWidget(ScriptedLoadableModuleWidget):
+    """The panel inside 3D Slicer. Tracking goes on while another module is shown."""
+
+    def setup(self):
+        """Draw the panel."""
+        super().setup()
+        from CranioNavLib.panel_qt import show_in
+        from CranioNavLib.panel_qt_widgets import Ticker
+
+        self.logic = ModuleTrackingLogic()
+        self.panel = show_in(self, PanelModel(PANEL, self.logic))
+        self.ticker = Ticker(self.parent, POLL_MS, self.logic.poll)
+        self.ticker.start()
+
+    def enter(self):
+        """The user opened the module."""
+        self.panel.start()
+        self.panel.refresh()
+
+    def exit(self):
+        """The user left the module."""
+        self.panel.stop()
+
+    def cleanup(self):
+        """The module is about to be unloaded."""
+        self.ticker.stop()
+        self.logic.disconnect()
+        self.panel.close()
+
+
+class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
+    """Frames of the tracker in, nodes out; `poll` is called by whoever owns the event loop."""
+
+    parameterClass = TrackingParameters
+    sessionRole = "TrackingSession"
+    refusals = (TrackerError,)
+
+    def __init__(self, parent=None):
+        super().__init__(parent)
+        self.stream = None
+        self._recorder = None
+        self._tips = {}  # tool name -> [(time in s, ToolToReference)] of the last frames
+        self._pivot = None  # (tool, end in s, poses) while a tool is being pivoted
+        self._calibrated = {}  # tool name -> what calibration found
+        self._failure = ""  # why calibration refused the last poses
+
+    # Connection
+
+    def connect(self):
+        """Open the tracker that the parameters name; poses arrive through `poll`."""
+        from ModuleTrackingLib.pose_stream import PoseStream
+
+        tracker = self.createPlugin("tracker", self.parameters().read().tracker)
+        self.stream = PoseStream(tracker, {tool: _tipToMarker(found) for tool, found in self._calibrated.items()})
+        self.stream.start()
+        return f"connecting to {tracker.title}"
+
+    def connectBlocked(self):
+        """Why no tracker can be connected now."""
+        return "disconnect first" if self.stream is not None else ""
+
+    def disconnect(self):
+        """Stop tracking; every tool is missing from now on."""
+        self.stopRecording()
+        self.cancelPivot()
+        if self.stream is not None:
+            self.stream.stop()
+            self.stream = None
+            for name in Tool:
+                scene_data.set_pose(f"{name.value}ToReference", None, PoseStatus.MISSING.value, 0.0)
+        self._tips.clear()
+
+    def disconnectBlocked(self):
+        """Why there is nothing to disconnect."""
+        return self._notConnected()
+
+    def poll(self):
+        """Take over the frames that came since the last call and write the tools' nodes. Main thread only."""
+        if self.stream is None:
+            return
+        try:
+            frames = self.stream.poll()
+        except InputError as error:
+            self.stream.stop()
+            self.stream, self._failure = None, str(error)
+            raise
+        for frame in frames:
+            self._writeFrame(frame)
+        if not frames:
+            self._writeStale()
+        if self._recorder is not None:
+            self._recorder.add_frames(frames)
+        self._finishPivot()
+
+    def _writeFrame(self, frame):
+        """Every tool at the time of this frame, in Reference."""
+        base = next((pose for pose in frame if pose.tool == "Reference"), None)
+        if base is not None and base.usable:
+            scene_data.set_transform("ReferenceToTracker", base.tool_to_tracker)
+        for pose in frame:
+            role = f"{pose.tool}ToReference"
+            if role not in scene.ROLES:
+                continue
+            relative = self.stream.in_reference_at(pose.tool, pose.host_time_s)
+            matrix = relative.tool_to_reference if relative.usable else None
+            scene_data.set_pose(role, matrix, relative.status.value, pose.host_time_s)
+            if matrix is not None:
+                tips = self._tips.setdefault(pose.tool, [])
+                tips.append((pose.host_time_s, matrix))
+                del tips[:-TIP_HISTORY]
+                if self._pivot is not None and self._pivot[0] == pose.tool:
+                    self._pivot[2].append(matrix)
+
+    def _writeStale(self):
+        """Tools without news lose their pose in the scene, too."""
+        for tool in Tool:
+            if tool.value in self.stream.tool_names:
+                current = self.stream.current_in_reference(tool.value)
+                if not current.usable:
+                    scene_data.set_pose(f"{tool.value}ToReference", None, current.status.value, current.host_time_s)
+
+    # Calibration
+
+    def startPivot(self):
+        """Collect poses of the chosen tool for `pivot_s`; `poll` then calibrates it."""
+        import time
+
+        wanted = self.parameters().read()
+        self._failure = ""
+        self._uncalibrate(wanted.tool.value)
+        self._pivot = (wanted.tool.value, time.monotonic() + wanted.pivot_s, [])
+        return f"pivot the {wanted.tool.value.lower()} for {wanted.pivot_s:.0f} s"
+
+    def startPivotBlocked(self):
+        """Why no tool can be calibrated now."""
+        return self._notConnected() or ("a tool is being pivoted" if self._pivot is not None else "")
+
+    def cancelPivot(self):
+        """Forget the poses collected."""
+        self._pivot = None
+
+    def cancelPivotBlocked(self):
+        """Why there is nothing to cancel."""
+        return "" if self._pivot is not None else "no tool is being pivoted"
+
+    def _uncalibrate(self, tool):
+        self._calibrated.pop(tool, None)
+        self.stream.calibrations.pop(tool, None)
+        self._tips.pop(tool, None)
+
+    def _finishPivot(self):
+        import time
+
+        import numpy as np
+        from ModuleTrackingLib.calibration.pivot import calibrate_pivot
+
+        if self._pivot is None or time.monotonic() < self._pivot[1]:
+            return
+        tool, _, poses = self._pivot
+        self._pivot = None
+        try:
+            self._calibrated[tool] = calibrate_pivot(np.reshape(poses, (-1, 4, 4)), np.random.default_rng(0))
+        except InputError as error:
+            self._failure = str(error)
+            return
+        self.stream.calibrations[tool] = _tipToMarker(self._calibrated[tool])
+        self._tips.pop(tool, None)
+
+    # Points
+
+    def digitise(self):
+        """Add the resting tip of the chosen tool to the chosen list. Returns a message."""
+        from CranioNavLib.slicer_files import LabelledPoints, add_points
+        from ModuleTrackingLib.digitise import rest_of_tip
+
+        wanted = self.parameters().read()
+        tool = wanted.tool.value
+        current = self.stream.current_in_reference(tool)
+        if not current.usable:
+            raise InputError(f"the {tool.lower()} has no pose ({current.reason}); show it to the camera and read the point again")
+        tips = [pose[:3, 3] for taken, pose in self._tips.get(tool, []) if taken > current.host_time_s - wanted.rest_s]
+        rest = rest_of_tip(tips)
+        label = self._nextLabel(wanted.points)
+        node = scene.find_or_create(wanted.points.value)
+        add_points(node, LabelledPoints((label,), rest.position_mm[None]))
+        return f"{label}: {rest.samples} samples, spread {rest.spread_mm:.2f} mm (RMS)"
+
+    def digitiseBlocked(self):
+        """Why no point can be read now."""
+        return self._notConnected() or ("a tool is being pivoted" if self._pivot is not None else "")
+
+    def undoPoint(self):
+        """Remove the last point of the chosen list. Returns a message."""
+        node = scene.find(self.parameters().read().points.value)
+        last = node.GetNumberOfControlPoints() - 1
+        label = node.GetNthControlPointLabel(last)
+        node.RemoveNthControlPoint(last)
+        return f"{label} removed"
+
+    def undoPointBlocked(self):
+        """Why there is no point to remove."""
+        node = scene.find(self.parameters().read().points.value)
+        return "" if node is not None and node.GetNumberOfControlPoints() else "the list has no points"
+
+    def _nextLabel(self, points):
+        """The first planned label that is not taken yet; a number where nothing is planned."""
+        taken = self._labels(points.value)
+        planned = {PointList.LANDMARKS: "LandmarksCT", PointList.TARGETS: "TargetsCT"}.get(points)
+        free = [label for label in self._labels(planned) if label not in taken] if planned else []
+        if free:
+            return free[0]
+        letter = {PointList.LANDMARKS: "L", PointList.BONE: "B", PointList.TARGETS: "T", PointList.PLAUSIBILITY: "P"}[points]
+        return f"{letter}{len(taken) + 1}"
+
+    def _labels(self, role):
+        node = scene.find(role)
+        return [node.GetNthControlPointLabel(i) for i in range(node.GetNumberOfControlPoints())] if node is not None else []
+
+    # Recording
+
+    def startRecording(self):
+        """Record all tools into `recording_path`. Returns a message."""
+        from ModuleTrackingLib.recorder import SessionRecorder
+
+        path = self.parameters().read().recording_path
+        self._recorder = SessionRecorder(path, self.stream)
+        return f"recording into {path}"
+
+    def startRecordingBlocked(self):
+        """Why nothing can be recorded now."""
+        if self._recorder is not None:
+            return "already recording"
+        return self._notConnected() or ("" if self.parameters().read().recording_path else "choose a file first")
+
+    def stopRecording(self):
+        """Finish the recording. Returns a message."""
+        if self._recorder is None:
+            return ""
+        recorder, self._recorder = self._recorder, None
+        recorder.close()
+        return f"{recorder.state.frames} frames in {recorder.state.path}"
+
+    def stopRecordingBlocked(self):
+        """Why there is no recording to stop."""
+        return "" if self._recorder is not None else "not recording"
+
+    # What the panel shows
+
+    def recording(self):
+        """What has been recorded so far."""
+        if self._recorder is None:
+            return None
+        state = self._recorder.state
+        return Reading(f"{state.frames} frames, {state.seconds:.1f} s, {state.without_probe} without the probe")
+
+    def connection(self):
+        """Connected and at which rate, or why not."""
+        if self.stream is None:
+            return Reading(self._failure or "not connected", Level.BAD if self._failure else Level.PLAIN)
+        state = self.stream.state
+        if not state.connected:
+            return Reading(state.problem, Level.WARNING)
+        return Reading(f"{state.rate_hz:.0f} frames a second", Level.GOOD)
+
+    def referenceTool(self):
+        """The reference base."""
+        if self.stream is None:
+            return None
+        pose = self.stream.current("Reference")
+        return Reading(", ".join(pose.flags) or pose.status.value, LEVELS.get(pose.status, Level.BAD))
+
+    def probeTool(self):
+        """The probe."""
+        return self._tool("Probe")
+
+    def stylusTool(self):
+        """The stylus."""
+        return self._tool("Stylus")
+
+    def sphereTool(self):
+        """The sphere tool."""
+        return self._tool("Sphere")
+
+    def _tool(self, tool):
+        if self.stream is None:
+            return None
+        pose = self.stream.current_in_reference(tool)
+        return Reading(pose.reason or pose.status.value, LEVELS.get(pose.status, Level.BAD))
+
+    def pivotProgress(self):
+        """How many poses have been collected."""
+        if self._failure and self._pivot is None:
+            return Reading(self._failure, Level.BAD)
+        return Reading(f"{len(self._pivot[2])} poses") if self._pivot is not None else None
+
+    def calibration(self):
+        """The calibration of the chosen tool."""
+        found = self._calibrated.get(self.parameters().read().tool.value)
+        if found is None:
+            return None
+        tip = ", ".join(f"{value:.2f}" for value in found.tip_in_marker_mm)
+        return Reading(f"({tip}) mm in the marker's frame, SD {found.tip_sd_mm:.2f} mm (worst direction)", Level.GOOD)
+
+    def nextPoint(self):
+        """The label that the next point gets."""
+        return Reading(self._nextLabel(self.parameters().read().points))
+
+    def trackerStatus(self):
+        """Whether poses arrive."""
+        if self.stream is None:
+            return StepStatus(StepState.ATTENTION if self._failure else StepState.TODO, self._failure or "connect the tracker")
+        state = self.stream.state
+        return StepStatus(StepState.DONE if state.connected else StepState.ATTENTION, state.problem)
+
+    def calibrationStatus(self):
+        """Whether the chosen tool is calibrated."""
+        if self._failure and self.stream is not None:
+            return StepStatus(StepState.ATTENTION, self._failure)
+        done = self.parameters().read().tool.value in self._calibrated
+        return StepStatus(StepState.DONE if done else StepState.TODO, "" if done else "pivot the tool, unless it is calibrated")
+
+    def pointsStatus(self):
+        """Whether every planned landmark is digitised."""
+        missing = [label for label in self._labels("LandmarksCT") if label not in self._labels("LandmarksPatient")]
+        if missing or not self._labels("LandmarksPatient"):
+            return StepStatus(StepState.TODO, f"still to touch: {', '.join(missing)}" if missing else "touch the landmarks")
+        return StepStatus(StepState.DONE)
+
+    def _notConnected(self):
+        return "" if self.stream is not None else "connect the tracker first"
+
+
+def _tipToMarker(found):
+    """The calibrated tool's frame in its marker's: same axes, origin at the tip."""
+    import numpy as np
+    from CranioNavLib.rigid import rigid
+
+    return rigid(np.eye(3), found.tip_in_marker_mm)
+
+
+class ModuleTrackingTest(ScriptedLoadableModuleTest):
+    """A stylus of the simulated tracker is calibrated, touches the landmarks, and is recorded."""
+
+    TIP_TOLERANCE_MM = 0.5  # simulated: tracker 0.25 mm, some hundred poses
+    LANDMARK_TOLERANCE_MM = 12.0  # simulated: four times the SD of finding a landmark; the test is of the wiring
+
+    def setUp(self):
+        """A fresh scene and a simulated patient of its own."""
+        from CranioNavLib.phantom import make_patient
+        from CranioNavLib.phantom.session import SimulatedSession, use_session
+
+        slicer.mrmlScene.Clear(False)
+        self.session = SimulatedSession(make_patient(None, seed=3), seed=3)
+        use_session(self.session)
+        self.logic = ModuleTrackingLogic()
+        self.logic.parameters().change(tracker="simulated")
+        settings = self.logic.pluginSettings("tracker", "simulated")
+        settings.change(rate_hz=60.0, calibrated=False)
+
+    def tearDown(self):
+        """Let go of the tracker."""
+        from CranioNavLib.phantom.session import use_session
+
+        self.logic.disconnect()
+        use_session(None)
+
+    def runTest(self):
+        """The scenarios."""
+        self.setUp()
+        try:
+            self.test_pivot_landmarks_and_recording()
+        finally:
+            self.tearDown()
+
+    def test_pivot_landmarks_and_recording(self):
+        """Pivot calibration finds the tip; digitised landmarks lie where the patient has them; the file holds them all."""
+        import tempfile
+
+        import numpy as np
+        from CranioNavLib.phantom import constants
+        from CranioNavLib.rigid import transform_points
+        from CranioNavLib.sequence_metafile import read_recording
+        from CranioNavLib.slicer_files import LabelledPoints
+
+        patient, logic = self.session.patient, self.logic
+        scene_data.set_points("LandmarksCT", LabelledPoints(patient.landmark_labels, patient.landmarks_ras_mm))
+        logic.connect()
+        self.session.pivot("Stylus")
+        self._run(1.5)
+        logic.parameters().change(tool=Tool.STYLUS, pivot_s=5.0)
+        logic.startPivot()
+        self._run(5.3)
+        assert "Stylus" in logic._calibrated, logic.pivotProgress()
+        error = np.linalg.norm(logic._calibrated["Stylus"].tip_in_marker_mm - constants.STYLUS_TIP_MM)
+        assert error < self.TIP_TOLERANCE_MM, f"tip is wrong by {error:.2f} mm"
+        self.delayDisplay(f"tip found to {error:.2f} mm")
+        with tempfile.TemporaryDirectory() as folder:
+            logic.parameters().change(recording_path=f"{folder}/session.igs.mha")
+            self.session.pivot("Probe")  # in view: a recording without the probe is refused
+            logic.startRecording()
+            for index in range(len(patient.landmarks_ras_mm)):
+                self.session.touch_landmark(index)
+                self._run(2.2)
+                logic.digitise()
+            logic.stopRecording()
+            recording = read_recording(f"{folder}/session.igs.mha")
+        touched = scene_data.get_points("LandmarksPatient")
+        assert touched.labels == tuple(patient.landmark_labels)
+        truth = transform_points(patient.ras_to_reference, patient.landmarks_ras_mm)
+        assert np.linalg.norm(touched.positions_mm - truth, axis=1).max() < self.LANDMARK_TOLERANCE_MM
+        assert "StylusToReference" in recording.other_transforms
+        self.session.put_away("Stylus")
+        self._run(0.5)
+        assert scene_data.get_pose("StylusToReference").matrix is None
+
+    def _run(self, seconds):
+        """The event loop, for some seconds."""
+        import time
+
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.logic.poll()
+            time.sleep(POLL_MS / 1000)

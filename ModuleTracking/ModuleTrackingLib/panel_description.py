@@ -1,0 +1,108 @@
+"""The tracking panel and its parameters, as data: drawn by Qt inside 3D Slicer and in the browser."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Annotated
+
+from CranioNavLib.panel import Action, FileField, NodeField, Panel, ParameterField, PluginField, ReadOut, Step
+from CranioNavLib.parameters import Limits, Parameters
+
+from ModuleTrackingLib.tracker import TRACKERS
+
+
+class Tool(str, Enum):
+    """The tools that have a tip."""
+
+    STYLUS = "Stylus"
+    SPHERE = "Sphere"
+    PROBE = "Probe"
+
+
+class PointList(str, Enum):
+    """Where a digitised point goes: a role of the scene."""
+
+    LANDMARKS = "LandmarksPatient"
+    BONE = "SurfacePoints"
+    TARGETS = "TargetsPatient"
+    PLAUSIBILITY = "PlausibilityPoints"
+
+
+@dataclass(frozen=True)
+class TrackingParameters(Parameters):
+    """What the tracking module keeps in the scene."""
+
+    tracker: Annotated[str, "where poses come from"] = "simulated"
+    tool: Annotated[Tool, "tool that is calibrated or digitises"] = Tool.STYLUS
+    points: Annotated[PointList, "list that the next point goes to"] = PointList.LANDMARKS
+    rest_s: Annotated[float, Limits(0.1, 10), "how long the tip must rest on a point"] = 0.7
+    pivot_s: Annotated[float, Limits(1, 120), "how long the tool is pivoted for its calibration"] = 10.0
+    recording_path: Annotated[str, "recording of all tools (.igs.mha)"] = ""
+
+
+PANEL = Panel(
+    module="ModuleTracking",
+    title="Tracking",
+    parameters=TrackingParameters,
+    steps=(
+        Step(
+            name="tracker",
+            title="Tracker",
+            help="Choose the tracker and connect. Every tool is shown live; a lost one is never shown where it was.",
+            items=(
+                PluginField("tracker", "Tracker", TRACKERS.kind),
+                Action("connect", "Connect", "Open the tracker and begin tracking", primary=True),
+                Action("disconnect", "Disconnect", "Stop tracking and let go of the tracker"),
+                ReadOut("connection", "Connection"),
+                ReadOut("referenceTool", "Reference base"),
+                ReadOut("probeTool", "Probe"),
+                ReadOut("stylusTool", "Stylus"),
+                ReadOut("sphereTool", "Sphere tool"),
+            ),
+            status="trackerStatus",
+        ),
+        Step(
+            name="calibration",
+            title="Calibration",
+            help="Set the tip into a divot that does not move and pivot the tool by 30° to all sides.",
+            items=(
+                ParameterField("tool"),
+                ParameterField("pivot_s", "Pivot for"),
+                Action("startPivot", "Pivot", "Begin to collect poses; the calibration follows by itself", primary=True),
+                Action("cancelPivot", "Cancel", "Forget the poses collected"),
+                ReadOut("pivotProgress", "Pivot"),
+                ReadOut("calibration", "Tip"),
+            ),
+            status="calibrationStatus",
+        ),
+        Step(
+            name="points",
+            title="Points",
+            help="Rest the tip on the point that is asked for, and read it.",
+            items=(
+                ParameterField("points", "List"),
+                ParameterField("rest_s", "Rest for"),
+                ReadOut("nextPoint", "Next point", large=True),
+                Action("digitise", "Read point", "Add the resting tip to the list", shortcut="Space", primary=True),
+                Action("undoPoint", "Undo", "Remove the last point of the list", shortcut="Ctrl+Z"),
+                NodeField("LandmarksPatient", "Landmarks"),
+                NodeField("SurfacePoints", "Bone points"),
+                NodeField("TargetsPatient", "Targets"),
+                NodeField("PlausibilityPoints", "Plausibility"),
+            ),
+            status="pointsStatus",
+        ),
+        Step(
+            name="recording",
+            title="Recording",
+            help="Every pose of every tool, into a file that any PLUS or IGSIO tool reads.",
+            items=(
+                FileField("recording_path", "File", ("Recording (*.igs.mha)",), save=True),
+                Action("startRecording", "Record", "Begin to record", primary=True),
+                Action("stopRecording", "Stop", "Finish the file"),
+                ReadOut("recording", "Recorded"),
+            ),
+        ),
+    ),
+)
