@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from CranioNavLib.rigid import Array, transform_points
-from CranioNavLib.surface import Surface
 
 if TYPE_CHECKING:
     from ModuleRegistrationLib.procedure import CaseResult
@@ -22,32 +21,29 @@ VIEWS = {
 }
 VIEW_PIXELS = 430
 RESIDUAL_COLORS = "RdBu_r"  # told apart by the colour-blind too
-MAP_TRIANGLES = 40_000  # enough for a colour map that a report shows at 430 pixels
+MESH_BINS = 140  # a side of the skull: 1.3 mm, about two pixels
+POINT_RADIUS_MM = 3.0
+LANDMARK_COLOR, TARGET_COLOR = "#e69f00", "#009e73"
 
 
 def skull_with_points(result: CaseResult) -> bytes:
-    """Four views of the skull; bone points coloured by their signed distance to the surface, targets as rings."""
+    """Four views of the skull; bone points coloured by their signed distance to the surface, targets and landmarks."""
     import pyvista
 
-    scene = _Views(result.bone.closed)
-    registration = result.registration
-    cloud, limits = None, (-0.5, 0.5)
+    plotter, registration = _plotter(), result.registration
+    plotter.add_mesh(_bone_mesh(result), color=BONE_COLOR, smooth_shading=True, specular=0.15)
+    color_bar = None
     if len(result.points):
         cloud = pyvista.PolyData(registration.points_ras_mm)
         cloud["residual (mm)"] = registration.residuals_mm
-        widest = float(np.ceil(2 * np.abs(registration.residuals_mm).max()) / 2)
-        limits = (-max(widest, 0.5), max(widest, 0.5))
-    landmarks = transform_points(registration.reference_to_ras, result.landmarks_patient_mm)
-    for plotter in scene.each():
-        scene.add_bone(plotter)
-        if cloud is not None:
-            balls = cloud.glyph(geom=pyvista.Sphere(radius=3.0), scale=False, orient=False)
-            plotter.add_mesh(balls, scalars="residual (mm)", cmap=RESIDUAL_COLORS, clim=limits, show_scalar_bar=False, ambient=0.4)
-        _add_balls(plotter, landmarks, 2.4, "#e69f00")
-        if result.case.targets_ct is not None:
-            _add_balls(plotter, result.targets_ras_mm, 2.2, "#009e73")
-    title = "distance of a point to the bone surface (mm), + outside" if cloud is not None else None
-    return scene.picture((RESIDUAL_COLORS, limits, title) if title else None)
+        widest = max(float(np.ceil(2 * np.abs(registration.residuals_mm).max()) / 2), 0.5)
+        balls = cloud.glyph(geom=pyvista.Sphere(radius=POINT_RADIUS_MM), scale=False, orient=False)
+        plotter.add_mesh(balls, cmap=RESIDUAL_COLORS, clim=(-widest, widest), show_scalar_bar=False, ambient=0.4)
+        color_bar = RESIDUAL_COLORS, (-widest, widest), "distance of a point to the bone surface (mm), + outside"
+    _add_balls(plotter, transform_points(registration.reference_to_ras, result.landmarks_patient_mm), LANDMARK_COLOR)
+    if result.case.targets_ct is not None:
+        _add_balls(plotter, result.targets_ras_mm, TARGET_COLOR)
+    return _four_views(plotter, color_bar)
 
 
 def error_map(result: CaseResult) -> bytes | None:
@@ -56,74 +52,76 @@ def error_map(result: CaseResult) -> bytes | None:
 
     if result.registration.covariance is None:
         return None
-    scene = _Views(result.bone.closed, MAP_TRIANGLES)
-    p95 = predict_tre_of(result.registration, np.asarray(scene.mesh.points)).p95_mm
-    scene.mesh["95% error (mm)"] = p95
+    mesh = _bone_mesh(result)
+    p95 = predict_tre_of(result.registration, np.asarray(mesh.points)).p95_mm
+    mesh["95% error (mm)"] = p95
     limits = (0.0, float(np.ceil(2 * p95.max()) / 2))
-    for plotter in scene.each():
-        plotter.add_mesh(
-            scene.mesh, scalars="95% error (mm)", cmap="viridis", clim=limits, smooth_shading=True, show_scalar_bar=False
-        )
-    return scene.picture(color_bar=("viridis", limits, "95% error to expect (mm)"))
+    plotter = _plotter()
+    plotter.add_mesh(mesh, scalars="95% error (mm)", cmap="viridis", clim=limits, smooth_shading=True, show_scalar_bar=False)
+    return _four_views(plotter, ("viridis", limits, "95% error to expect (mm)"))
 
 
-def _add_balls(plotter: Any, positions: Array, radius: float, color: str) -> None:
+def _plotter() -> Any:
+    import pyvista
+
+    plotter = pyvista.Plotter(off_screen=True, window_size=(VIEW_PIXELS, VIEW_PIXELS))
+    plotter.set_background("white")
+    return plotter
+
+
+def _add_balls(plotter: Any, positions: Array, color: str) -> None:
     import pyvista
 
     if len(positions):
-        plotter.add_mesh(
-            pyvista.PolyData(positions).glyph(geom=pyvista.Sphere(radius=radius), scale=False, orient=False), color=color
-        )
+        geometry = pyvista.Sphere(radius=0.8 * POINT_RADIUS_MM)
+        plotter.add_mesh(pyvista.PolyData(positions).glyph(geom=geometry, scale=False, orient=False), color=color)
 
 
-class _Views:
-    """Four views of one mesh, side by side."""
+def _bone_mesh(result: CaseResult) -> Any:
+    """The bone, thinned to what a picture shows, with smooth normals."""
+    import pyvista
+    from vtkmodules.vtkFiltersCore import vtkBinnedDecimation, vtkPolyDataNormals
 
-    def __init__(self, surface: Surface, triangles: int = 150_000) -> None:
-        import pyvista
+    thin = vtkBinnedDecimation()
+    thin.SetInputData(result.bone.closed.to_polydata())
+    thin.SetNumberOfDivisions(MESH_BINS, MESH_BINS, MESH_BINS)
+    thin.AutoAdjustNumberOfDivisionsOff()
+    thin.SetPointGenerationModeToBinAverages()
+    smooth = vtkPolyDataNormals()
+    smooth.SetInputConnection(thin.GetOutputPort())
+    smooth.SplittingOff()
+    smooth.ConsistencyOff()
+    smooth.Update()
+    return pyvista.wrap(smooth.GetOutput())
 
-        mesh = pyvista.wrap(surface.to_polydata())
-        if mesh.n_cells > triangles:
-            mesh = mesh.decimate(1 - triangles / mesh.n_cells)
-        self.mesh = mesh.compute_normals(auto_orient_normals=False, split_vertices=False)
-        self._plotter = pyvista.Plotter(
-            off_screen=True, shape=(1, len(VIEWS)), border=False, window_size=(VIEW_PIXELS * len(VIEWS), VIEW_PIXELS)
-        )
 
-    def each(self) -> Any:
-        """The plotter, set to each view in turn."""
-        middle, size = self.mesh.center, self.mesh.length
-        for column, (name, (direction, up)) in enumerate(VIEWS.items()):
-            self._plotter.subplot(0, column)
-            self._plotter.set_background("white")
-            yield self._plotter
-            self._plotter.add_text(name, position="upper_left", font_size=9, color="#444444")
-            self._plotter.camera.parallel_projection = True
-            self._plotter.camera.focal_point = middle
-            self._plotter.camera.position = np.add(middle, np.multiply(direction, 2 * size))
-            self._plotter.camera.up = up
-            self._plotter.camera.parallel_scale = 0.36 * size
-            self._plotter.reset_camera_clipping_range()
+def _four_views(plotter: Any, color_bar: tuple[str, tuple[float, float], str] | None) -> bytes:
+    """PNG of the plotter's scene from four sides, with a colour bar (map, limits, title) below."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
 
-    def add_bone(self, plotter: Any) -> None:
-        plotter.add_mesh(self.mesh, color=BONE_COLOR, smooth_shading=True, specular=0.15)
-
-    def picture(self, color_bar: tuple[str, tuple[float, float], str] | None = None) -> bytes:
-        """PNG of the views, with a colour bar (map, limits, title) below."""
-        import matplotlib as mpl
-        from matplotlib.figure import Figure
-
-        pixels = self._plotter.screenshot(return_img=True)
-        self._plotter.close()
-        figure = Figure(figsize=(14, 4.4), dpi=110)
-        axes = figure.add_axes((0.0, 0.17, 1.0, 0.83))
-        axes.imshow(pixels)
+    middle, size = np.array(plotter.center), float(plotter.length)
+    figure = Figure(figsize=(14, 4.4), dpi=110)
+    for column, (name, (direction, up)) in enumerate(VIEWS.items()):
+        camera = plotter.camera
+        camera.parallel_projection = True
+        camera.focal_point, camera.up = middle, up
+        camera.position = middle + 2 * size * np.array(direction)
+        camera.parallel_scale = 0.36 * size
+        plotter.reset_camera_clipping_range()
+        plotter.render()
+        axes = figure.add_axes((column / len(VIEWS), 0.17, 1 / len(VIEWS), 0.76))
+        axes.imshow(plotter.screenshot(return_img=True))
         axes.set_axis_off()
-        if color_bar is not None:
-            cmap, limits, title = color_bar
-            bar = figure.add_axes((0.3, 0.13, 0.4, 0.03))
-            figure.colorbar(mpl.cm.ScalarMappable(mpl.colors.Normalize(*limits), cmap), cax=bar, orientation="horizontal", label=title)
-        return _png(figure)
+        axes.set_title(name, fontsize=9, color="#444444")
+    plotter.close()
+    if color_bar is not None:
+        cmap, limits, title = color_bar
+        bar = figure.add_axes((0.3, 0.13, 0.4, 0.03))
+        figure.colorbar(
+            mpl.cm.ScalarMappable(mpl.colors.Normalize(*limits), cmap), cax=bar, orientation="horizontal", label=title
+        )
+    return _png(figure)
 
 
 def slices_with_points(result: CaseResult) -> bytes:
