@@ -57,6 +57,10 @@ REFERENCE_BASE_DISTANCE_MM = (120.0, 220.0)  # [M] reference base on its clamp t
 CAMERA_DISTANCE_MM = (1100.0, 1600.0)  # [M] working volume of a Vicra or Polaris
 TOOL_ORIGIN_OFFSET_MM = 120.0  # [M] marker frame of a tool to its tip: the lever of the orientation error
 
+# Error of the probe's own calibration, one draw a session: where the face is (per axis) and where the beam points
+PROBE_CALIBRATION_SD_MM = 0.25  # [M] residual of calibrations with a wire or plane phantom, 0.2-0.5 mm
+PROBE_CALIBRATION_SD_DEG = 0.3  # [S] Heger 2005: 0.28 degrees
+
 # --- Sound in tissue ------------------------------------------------------------------------------------------------
 SPEED_OF_SOUND_RANGE_M_S = (1450.0, 1630.0)  # [S] chapter: soft tissue range; one draw a patient
 SPEED_OF_SOUND_SITE_SD_M_S = 8.0  # [M] from place to place in one head: fat and muscle shares

@@ -43,7 +43,7 @@ def palpate(
     poses_ras = hold(stand, lines_per_point, rng, skill).reshape(-1, 4, 4)
     true_poses: Array = patient.ras_to_reference @ poses_ras
     points = np.repeat(np.arange(count), lines_per_point)
-    reported = patient.tracker_error.of_poses(true_poses, rng, points)
+    reported = patient.tracker_error.of_poses(true_poses @ patient.probe_calibration_error, rng, points)
     missing = rng.random(len(reported)) < missing_share
     reported[missing] = np.nan
     dwell_s = lines_per_point / constants.LINE_RATE_HZ

@@ -17,7 +17,7 @@ from CranioNavLib.phantom.planning_ct import scan
 from CranioNavLib.phantom.sites import LANDMARK_LABELS, SAMPLE_HEAD_LANDMARKS_MM, marker_positions, snap_to_bone
 from CranioNavLib.phantom.tracking import TrackerError
 from CranioNavLib.phantom.ultrasound import Tissue, acquisition, simulate_lines
-from CranioNavLib.rigid import Array, invert_rigid, rigid, transform_points
+from CranioNavLib.rigid import Array, invert_rigid, rigid, rigid_from_vector, transform_points
 from CranioNavLib.sample_head import SHA256 as SAMPLE_SHA256
 from CranioNavLib.sample_head import SHAPE as SAMPLE_SHAPE
 from CranioNavLib.sequence_metafile import Acquisition
@@ -53,6 +53,7 @@ class VirtualPatient:
     tissue: Tissue
     tracker_error: TrackerError
     acquisition: Acquisition
+    probe_calibration_error: Array  # (4, 4) the reported Probe frame in the true one
 
     @property
     def planning_ct(self) -> Volume:
@@ -142,6 +143,10 @@ def make_patient(
         tissue=Tissue.draw(rng),
         tracker_error=TrackerError(Rotation.random(random_state=rng).as_matrix()),
         acquisition=acquisition(),
+        probe_calibration_error=rigid_from_vector(
+            np.radians(rng.normal(0.0, constants.PROBE_CALIBRATION_SD_DEG, 3)),
+            rng.normal(0.0, constants.PROBE_CALIBRATION_SD_MM, 3),
+        ),
     )
 
 

@@ -230,7 +230,9 @@ class SimulatedSession:
                 continue
             tip = rigid(np.eye(3), TIPS_MM[tool])
             seen = self._seen(tool, base @ pose @ invert_rigid(tip), self._held_number(tool), noise)
-            reported[tool] = seen @ tip if calibrated else seen
+            if calibrated:
+                seen = seen @ tip @ self.patient.probe_calibration_error if tool == PROBE else seen @ tip
+            reported[tool] = seen
         return reported
 
     def rf_line(self, time_s: float) -> npt.NDArray[np.int16]:
