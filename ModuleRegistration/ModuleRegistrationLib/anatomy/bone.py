@@ -8,16 +8,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from CranioNavLib.errors import InputError
-from CranioNavLib.rigid import Array
 from CranioNavLib.surface import Surface
 from CranioNavLib.volume import Volume
 
-from ModuleRegistrationLib.anatomy.grid import Grid, Mask, subsampled
-from ModuleRegistrationLib.anatomy.head import Head
+from ModuleRegistrationLib.anatomy.grid import Floats, Grid, Mask, pooled, spread, subsampled
+from ModuleRegistrationLib.anatomy.head import COARSE_MM, Head
 
 SOFT_RANGE_HU = (-150, 150)  # where the soft tissue's peak is looked for
 LOWEST_BONE_HU, HIGHEST_BONE_HU = 150, 2000  # the range in which bone is told from soft tissue; metal and enamel lie above
 LOWEST_THRESHOLD_HU, HIGHEST_THRESHOLD_HU = 180.0, 450.0
+AIR_HU = -1024
+PIECES_MM = 0.9  # grid on which separate pieces are told apart
 SMALLEST_PIECE_ML = 1.0  # smaller separate pieces (calcifications, hyoid, electrodes) are left out
 SMALLEST_BONE_ML = 20.0  # a slab of skull a few slices thick
 
@@ -31,13 +32,33 @@ class BoneVoxels:
 
     hu: npt.NDArray[np.int16]
     origin: tuple[int, int, int]  # first voxel of the cut-out in the volume, order k, j, i
+    grid: Grid  # of the whole volume
     threshold_hu: float
     soft_hu: float  # the soft tissue's peak
 
-    def to_index(self, kji: Array) -> Array:
-        """Indices into `hu` for fractional indices (N, 3) of the whole volume."""
-        shifted: Array = kji - (np.array(self.origin) - 1)
-        return shifted
+    @property
+    def corner_mm(self) -> Floats:
+        """(3,) grid mm of the whole volume at which `hu[0, 0, 0]` lies."""
+        corner: Floats = ((np.array(self.origin) - 1) * self.grid.spacing_mm)[::-1].astype(np.float32)
+        return corner
+
+
+@dataclass(frozen=True, eq=False)
+class BoneMesh:
+    """The closed iso-surface in the grid mm of the whole volume; triangles are counter-clockwise seen in RAS from outside."""
+
+    points: Floats  # (V, 3)
+    normals: Floats  # (V, 3) unit, outward: against the gradient of the CT
+    triangles: npt.NDArray[np.int32]  # (T, 3)
+
+    def surface(self, grid: Grid, which: npt.NDArray[np.int32] | None = None) -> Surface:
+        """The mesh in RAS, or the part of it that the triangles `which` (M, 3) make up."""
+        if which is None:
+            return Surface(grid.grid_mm_to_ras(self.points), self.triangles.astype(np.int64))
+        used = np.zeros(len(self.points), dtype=bool)
+        used[which.ravel()] = True
+        number = np.cumsum(used) - 1
+        return Surface(grid.grid_mm_to_ras(self.points[used]), number[which])
 
 
 def tissue_levels(volume: Volume, head: Head) -> tuple[float, float, float]:
@@ -53,7 +74,7 @@ def tissue_levels(volume: Volume, head: Head) -> tuple[float, float, float]:
         The values in the head are not Hounsfield units of a head, or it has no bone.
     """
     full = Grid.of(volume)
-    values = subsampled(volume.hu, full.strides(2.5))[head.mask]
+    values = subsampled(volume.hu, full.strides(COARSE_MM))[head.mask]
     soft = values[(values > SOFT_RANGE_HU[0]) & (values < SOFT_RANGE_HU[1])]
     dense = values[(values > LOWEST_BONE_HU) & (values < HIGHEST_BONE_HU)]
     if len(soft) < 0.2 * len(values):
@@ -61,7 +82,7 @@ def tissue_levels(volume: Volume, head: Head) -> tuple[float, float, float]:
             f"the CT is not in Hounsfield units: only {100 * len(soft) / len(values):.0f}% of the head lies between "
             f"{SOFT_RANGE_HU[0]} and {SOFT_RANGE_HU[1]} HU; export it with its rescale slope and intercept applied"
         )
-    if len(dense) * full.coarser(full.strides(2.5)).voxel_mm3 < SMALLEST_BONE_ML * 1000:
+    if len(dense) * full.coarser(full.strides(COARSE_MM)).voxel_mm3 < SMALLEST_BONE_ML * 1000:
         raise InputError("the CT holds no bone of a skull above 150 HU; give a CT of the head in Hounsfield units")
     counts, edges = np.histogram(soft, bins=60, range=SOFT_RANGE_HU)
     peak = int(np.argmax(np.convolve(counts, np.ones(5), mode="same")))
@@ -93,48 +114,50 @@ def bone_voxels(volume: Volume, head: Head, threshold_hu: float, soft_hu: float)
         Nothing of a skull's size is denser than the threshold.
     """
     grid = Grid.of(volume)
-    strides = grid.strides(2.5)
+    coarse = grid.strides(COARSE_MM)
     inside = _grown(head.mask)
-    box = _box(inside, strides, grid.shape)
-    hu = np.pad(volume.hu[box], 1, constant_values=-1024)
-    bone = np.zeros(hu.shape, dtype=bool)
-    bone[1:-1, 1:-1, 1:-1] = (volume.hu[box] >= threshold_hu) & _refined(inside, strides, box)
-    kept = _pieces(bone, SMALLEST_PIECE_ML * 1000 / grid.voxel_mm3)
-    if kept.sum() * grid.voxel_mm3 < SMALLEST_BONE_ML * 1000:
+    box = _box(inside, coarse, grid.shape)
+    cut = volume.hu[box]
+    dense = cut >= threshold_hu
+    fine = grid.strides(PIECES_MM)
+    blocks = pooled(dense, fine)
+    centers = [np.minimum((np.arange(n) * s + s // 2 + part.start) // c, m - 1)
+               for n, s, c, m, part in zip(blocks.shape, fine, coarse, inside.shape, box)]  # fmt: skip
+    kept = _pieces(blocks & inside[np.ix_(*centers)], SMALLEST_PIECE_ML * 1000 / (grid.voxel_mm3 * float(np.prod(fine))))
+    dense_kept = spread(kept, fine, cut.shape) & dense
+    if np.count_nonzero(dense_kept) * grid.voxel_mm3 < SMALLEST_BONE_ML * 1000:
         raise InputError(f"the CT holds no skull denser than {threshold_hu:.0f} HU; lower the threshold or give a head CT in HU")
-    hu[(hu >= threshold_hu) & ~kept] = min(soft_hu, threshold_hu - 1)
-    return BoneVoxels(hu, (box[0].start, box[1].start, box[2].start), threshold_hu, soft_hu)
+    hu = np.full(tuple(n + 2 for n in cut.shape), AIR_HU, dtype=np.int16)
+    inner = hu[1:-1, 1:-1, 1:-1]
+    inner[...] = cut
+    inner[dense & ~dense_kept] = int(min(soft_hu, threshold_hu - 1))
+    return BoneVoxels(hu, (box[0].start, box[1].start, box[2].start), grid, threshold_hu, soft_hu)
 
 
-def closed_surface(voxels: BoneVoxels, grid: Grid) -> Surface:
-    """The closed iso-surface of the bone at the threshold, outward normals, RAS."""
+def bone_mesh(voxels: BoneVoxels) -> BoneMesh:
+    """The closed iso-surface of the bone at the threshold."""
     from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
     from vtkmodules.vtkCommonDataModel import vtkImageData
     from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D
 
     image: Any = vtkImageData()
     image.SetDimensions(*voxels.hu.shape[::-1])
+    image.SetSpacing(*voxels.grid.spacing_mm[::-1])
     image.GetPointData().SetScalars(numpy_to_vtk(voxels.hu.ravel(), deep=False))
     contour = vtkFlyingEdges3D()
     contour.SetInputData(image)
     contour.SetValue(0, voxels.threshold_hu)
-    contour.ComputeNormalsOff()
+    contour.ComputeNormalsOn()
     contour.ComputeGradientsOff()
     contour.ComputeScalarsOff()
     contour.Update()
     mesh = contour.GetOutput()
-    ijk = vtk_to_numpy(mesh.GetPoints().GetData()).astype(float)
-    kji = ijk[:, ::-1] + (np.array(voxels.origin) - 1)
-    triangles = vtk_to_numpy(mesh.GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.int64)
-    vertices = grid.to_ras(kji)
-    if _signed_volume(vertices, triangles) < 0:
+    points = vtk_to_numpy(mesh.GetPoints().GetData()).astype(np.float32) + voxels.corner_mm
+    normals = vtk_to_numpy(mesh.GetPointData().GetNormals()).astype(np.float32)
+    triangles = vtk_to_numpy(mesh.GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.int32)
+    if voxels.grid.left_handed:
         triangles = np.ascontiguousarray(triangles[:, ::-1])
-    return Surface(vertices, triangles)
-
-
-def _signed_volume(vertices: Array, triangles: npt.NDArray[np.int64]) -> float:
-    a, b, c = (vertices[triangles[:, corner]] - vertices[0] for corner in range(3))
-    return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6
+    return BoneMesh(points, normals, triangles)
 
 
 def _grown(mask: Mask) -> Mask:
@@ -151,14 +174,6 @@ def _box(mask: Mask, strides: tuple[int, int, int], shape: tuple[int, int, int])
         last = size if used[-1] == mask.shape[axis] - 1 else (used[-1] + 1) * stride
         slices.append(slice(int(used[0] * stride), int(min(last, size))))
     return slices[0], slices[1], slices[2]
-
-
-def _refined(mask: Mask, strides: tuple[int, int, int], box: tuple[slice, slice, slice]) -> Mask:
-    """A coarse mask at full resolution, inside `box`."""
-    for axis, (stride, part) in enumerate(zip(strides, box)):
-        index = np.minimum(np.arange(part.start, part.stop) // stride, mask.shape[axis] - 1)
-        mask = np.take(mask, index, axis=axis)
-    return mask
 
 
 def _pieces(bone: Mask, at_least: float) -> Mask:

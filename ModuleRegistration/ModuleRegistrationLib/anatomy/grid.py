@@ -1,4 +1,9 @@
-"""The voxel grid of a volume: spacing, orientation, points to RAS and back, a coarser copy."""
+"""The voxel grid of a volume: spacing, orientation, points to RAS and back, a coarser copy.
+
+Three ways to say where something is: RAS (mm); index (k, j, i), as arrays are subscripted, possibly fractional;
+and grid millimetres (x, y, z) = (i, j, k) times the spacing, along the grid's own axes: RAS but for a rigid
+motion (and a mirror, where the grid is left-handed), and what iso-surface filters work in.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +16,12 @@ from CranioNavLib.rigid import Array
 from CranioNavLib.volume import Volume
 
 Mask = npt.NDArray[np.bool_]
+Floats = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Where voxel indices lie. Index arrays are in array order (k, j, i); points are (x, y, z) in RAS, mm."""
+    """Where voxels lie."""
 
     shape: tuple[int, int, int]  # (K, J, I)
     ijk_to_ras: Array  # (4, 4)
@@ -37,6 +43,17 @@ class Grid:
         """Volume of a voxel."""
         return float(abs(np.linalg.det(self.ijk_to_ras[:3, :3])))
 
+    @property
+    def axes(self) -> Array:
+        """(3, 3) columns: unit vectors of i, j, k in RAS."""
+        columns: Array = self.ijk_to_ras[:3, :3] / np.linalg.norm(self.ijk_to_ras[:3, :3], axis=0)
+        return columns
+
+    @property
+    def left_handed(self) -> bool:
+        """Whether the grid's axes mirror RAS."""
+        return bool(np.linalg.det(self.ijk_to_ras[:3, :3]) < 0)
+
     def to_ras(self, kji: npt.ArrayLike) -> Array:
         """Points (N, 3) at voxel indices (N, 3), which may be fractional."""
         ijk = np.asarray(kji, dtype=float)[..., ::-1]
@@ -44,22 +61,20 @@ class Grid:
         return points
 
     def to_index(self, points_mm: npt.ArrayLike) -> Array:
-        """Fractional voxel indices (N, 3), order k, j, i, of points (N, 3)."""
+        """Fractional voxel indices (N, 3), order k, j, i, of points (N, 3) in RAS."""
         inverse = np.linalg.inv(self.ijk_to_ras)
         ijk = np.asarray(points_mm, dtype=float) @ inverse[:3, :3].T + inverse[:3, 3]
         kji: Array = ijk[..., ::-1]
         return kji
 
-    def direction_to_ras(self, kji_mm: npt.ArrayLike) -> Array:
-        """Directions (N, 3) given along the grid's own axes (k, j, i, each in mm), turned into RAS."""
-        axes = self.ijk_to_ras[:3, :3] / np.linalg.norm(self.ijk_to_ras[:3, :3], axis=0)
-        turned: Array = np.asarray(kji_mm, dtype=float)[..., ::-1] @ axes.T
-        return turned
+    def grid_mm_to_ras(self, points: npt.ArrayLike) -> Array:
+        """Points (N, 3) in RAS of points in grid millimetres."""
+        moved: Array = np.asarray(points, dtype=float) @ self.axes.T + self.ijk_to_ras[:3, 3]
+        return moved
 
     def axis_of(self, direction_ras: npt.ArrayLike) -> tuple[int, int]:
         """The array axis (0: k, 1: j, 2: i) nearest to a RAS direction, and the sign in which it grows."""
-        columns = self.ijk_to_ras[:3, :3] / np.linalg.norm(self.ijk_to_ras[:3, :3], axis=0)
-        along = np.asarray(direction_ras, dtype=float) @ columns
+        along = np.asarray(direction_ras, dtype=float) @ self.axes
         axis = int(np.argmax(np.abs(along)))
         return 2 - axis, 1 if along[axis] > 0 else -1
 
@@ -69,7 +84,7 @@ class Grid:
         return int(k), int(j), int(i)
 
     def coarser(self, strides: tuple[int, int, int]) -> Grid:
-        """The grid of `array[k//2::k, j//2::j, i//2::i]` for strides (k, j, i)."""
+        """The grid of `subsampled(array, strides)`."""
         offset = np.array(strides) // 2
         k, j, i = (len(range(o, n, s)) for o, n, s in zip(offset, self.shape, strides))
         matrix = self.ijk_to_ras.copy()
@@ -78,19 +93,37 @@ class Grid:
         return Grid((k, j, i), matrix)
 
 
-def subsampled(array: npt.NDArray[np.int16], strides: tuple[int, int, int]) -> npt.NDArray[np.int16]:
+def subsampled(array: npt.NDArray[Any], strides: tuple[int, int, int]) -> npt.NDArray[Any]:
     """Every stride-th voxel, from the middle of the first block: fits `Grid.coarser`."""
     k, j, i = strides
     return array[k // 2 :: k, j // 2 :: j, i // 2 :: i]
 
 
-def sample(array: npt.NDArray[Any], kji: Array) -> npt.NDArray[Any]:
-    """Values at the nearest voxels of fractional indices (N, 3); indices outside are clamped to the border."""
-    index = np.rint(kji).astype(np.intp)
-    for axis, size in enumerate(array.shape):
-        np.clip(index[:, axis], 0, size - 1, out=index[:, axis])
-    values: npt.NDArray[Any] = array.ravel()[(index[:, 0] * array.shape[1] + index[:, 1]) * array.shape[2] + index[:, 2]]
-    return values
+def pooled(mask: Mask, strides: tuple[int, int, int]) -> Mask:
+    """Whether any voxel of each block is set; blocks at the far end may be smaller."""
+    for axis, stride in enumerate(strides):
+        if stride > 1:
+            mask = np.logical_or.reduceat(mask, np.arange(0, mask.shape[axis], stride), axis=axis)
+    return mask
+
+
+def spread(blocks: npt.NDArray[Any], strides: tuple[int, int, int], shape: tuple[int, ...]) -> npt.NDArray[Any]:
+    """The value of each voxel's block: undoes `pooled` to the given shape."""
+    for axis, (stride, size) in enumerate(zip(strides, shape)):
+        if stride > 1:
+            blocks = np.take(blocks, np.minimum(np.arange(size) // stride, blocks.shape[axis] - 1), axis=axis)
+    return blocks
+
+
+def nearest_voxels(points: npt.NDArray[Any], spacing_mm: Array, shape: tuple[int, ...]) -> npt.NDArray[np.int32]:
+    """(N,) flat subscripts of the voxels nearest to points (N, 3) in grid mm; those outside go to the border."""
+    flat = np.zeros(len(points), dtype=np.int32)
+    for axis in range(3):  # k, j, i
+        index = np.rint(points[:, 2 - axis] * np.float32(1 / spacing_mm[axis])).astype(np.int32)
+        np.clip(index, 0, shape[axis] - 1, out=index)
+        flat *= np.int32(shape[axis])
+        flat += index
+    return flat
 
 
 def sample_linear(array: npt.NDArray[Any], kji: Array) -> Array:

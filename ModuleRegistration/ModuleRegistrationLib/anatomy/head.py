@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array
 from CranioNavLib.volume import Volume
 
-from ModuleRegistrationLib.anatomy.grid import Grid, Mask, sample, sample_linear, subsampled
+from ModuleRegistrationLib.anatomy.grid import Floats, Grid, Mask, nearest_voxels, sample_linear, subsampled
 
 AIR_TISSUE_HU = -300  # above foam cushions (about -650) and hair, below fat (-120)
 COARSE_MM = 2.5
@@ -37,20 +38,23 @@ class Head:
 
     def contains(self, points_mm: Array) -> Mask:
         """(N,) whether points (N, 3) in RAS lie in the head."""
-        return np.asarray(sample(self.mask, self.grid.to_index(points_mm)), dtype=bool)
+        return np.asarray(self.depth_at(points_mm) > 0)
 
-    def towards_skin(self, points_mm: Array) -> Array:
-        """(N, 3) unit vectors in RAS from points to where the skin is nearest."""
-        spacing = self.grid.spacing_mm
-        index = self.grid.to_index(points_mm)
-        slope = np.empty((len(index), 3))
-        for axis in range(3):
-            step = np.zeros(3)
-            step[axis] = 3.0 / spacing[axis]  # 3 mm: more than a step of the mask
-            rise = sample_linear(self.depth_mm, index - step) - sample_linear(self.depth_mm, index + step)
-            slope[:, axis] = rise
-        slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
-        return self.grid.direction_to_ras(slope)
+    @cached_property
+    def towards_skin(self) -> Floats:
+        """(K * J * I, 3) unit vectors (grid mm: x, y, z) to where the skin is nearest, smoothed over about 5 mm."""
+        from scipy import ndimage
+
+        smooth = ndimage.gaussian_filter(np.clip(self.depth_mm, -60, 60), 2.0 / self.grid.spacing_mm, truncate=2.0)
+        slopes = np.gradient(smooth, *self.grid.spacing_mm.astype(np.float32))
+        field = np.stack([-slope.ravel() for slope in slopes[::-1]], axis=1)
+        field /= np.maximum(np.sqrt(np.einsum("ij,ij->i", field, field)), 1e-6)[:, None]
+        return np.asarray(field, dtype=np.float32)
+
+    def cells(self, points: Floats, full: Grid) -> npt.NDArray[np.int32]:
+        """(N,) flat subscripts of the head's cells nearest to points (N, 3) in the grid mm of the whole volume."""
+        offset = (self.grid.ijk_to_ras[:3, 3] - full.ijk_to_ras[:3, 3]) @ full.axes
+        return nearest_voxels(points - offset.astype(np.float32), self.grid.spacing_mm, self.grid.shape)
 
 
 def find_head(volume: Volume) -> Head:

@@ -2,7 +2,7 @@
 
 Matching palpated points to the whole bone surface lets them fall onto the inner table, into sinuses and
 orbits. Kept here is what looks towards the skin, has no bone between itself and the skin, and lies no deeper
-than a probe reaches.
+than a probe reaches. Where that ends (orbits, openings, defects) a narrow margin is taken off as well.
 """
 
 from __future__ import annotations
@@ -10,94 +10,144 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 from CranioNavLib.errors import InputError
-from CranioNavLib.rigid import Array
-from CranioNavLib.surface import Surface
 
-from ModuleRegistrationLib.anatomy.bone import BoneVoxels
-from ModuleRegistrationLib.anatomy.grid import Grid, Mask, sample
+from ModuleRegistrationLib.anatomy.bone import BoneMesh, BoneVoxels
+from ModuleRegistrationLib.anatomy.grid import Floats, Grid, Mask
 from ModuleRegistrationLib.anatomy.head import Head
 
 REACH_MM = 22.0  # soft tissue over the temple with its muscle is up to 15 mm; some more for a swollen scalp
 FACING_COSINE = 0.5  # 60 deg: a wall steeper to the skin than this gives no echo and is no place to touch
 MARCH_MM = 1.0  # step along the way to the skin; structures thinner than this are below the CT's resolution
+BEYOND_MM, AT_SKIN_MM = 4.0, 1.0  # so far past the skin a place must be at most so deep: a cell of the head is 2.5 mm
 BORDER_MM = 4.0  # nothing is kept this close to where the volume ends: its caps are cuts, not bone
+OPENING_MM = 15.0  # an edge this long or longer is that of an opening; shorter ones are pits of the threshold
+MARGIN_MM = 1.0  # taken off along such edges, where the surface bends inwards
 SMALLEST_PATCH_MM2 = 400.0  # separate patches smaller than 2 x 2 cm are crumbs of face and ear
 
+Triangles = npt.NDArray[np.int32]
 
-def outer_table(closed: Surface, voxels: BoneVoxels, grid: Grid, head: Head) -> Surface:
-    """The part of `closed` that can be palpated.
+
+def outer_table(mesh: BoneMesh, voxels: BoneVoxels, head: Head, barred: Mask) -> Triangles:
+    """The triangles (M, 3) of the mesh that can be palpated.
+
+    Parameters
+    ----------
+    mesh, voxels, head
+        The bone and the head around it.
+    barred
+        The head's cells (its grid) whose bone is to be left out: metal, teeth, the jaw.
 
     Raises
     ------
     InputError
         Hardly anything can be reached: the volume is no head, or shows too little of it.
     """
-    reachable = reachable_vertices(closed, voxels, grid, head)
-    triangles = closed.triangles[reachable[closed.triangles].all(axis=1)]
-    triangles = _large_patches(closed.vertices_mm, triangles)
+    reachable = reachable_vertices(mesh, voxels, head, barred)
+    kept = np.asarray(reachable[mesh.triangles].all(axis=1))
+    kept = _without_margins(mesh, kept)
+    triangles = _large_patches(mesh.points, mesh.triangles[kept])
     if len(triangles) == 0:
         raise InputError("no part of the bone can be reached from the skin; the CT shows too little of the head's outside")
-    return _compact(closed.vertices_mm, triangles)
+    return triangles
 
 
-def reachable_vertices(closed: Surface, voxels: BoneVoxels, grid: Grid, head: Head) -> Mask:
+def reachable_vertices(mesh: BoneMesh, voxels: BoneVoxels, head: Head, barred: Mask) -> Mask:
     """(V,) whether a probe on the skin can reach a vertex of the bone surface."""
-    points = closed.vertices_mm
-    depth = head.depth_at(points)
-    index = grid.to_index(points)
-    margin = np.minimum(index, np.array(grid.shape) - 1 - index) * grid.spacing_mm
-    found = np.flatnonzero((depth < REACH_MM) & (margin.min(axis=1) > BORDER_MM))
-    towards = head.towards_skin(points[found])
-    facing = np.einsum("ij,ij->i", closed.vertex_normals[found], towards) > FACING_COSINE
+    grid = voxels.grid
+    cells = head.cells(mesh.points, grid)
+    near_skin = (head.depth_mm < REACH_MM) & ~barred
+    found = np.flatnonzero(near_skin.ravel()[cells] & _clear_of_border(mesh.points, grid))
+    towards = head.towards_skin[cells[found]]
+    facing = np.einsum("ij,ij->i", mesh.normals[found], towards) > FACING_COSINE
     found, towards = found[facing], towards[facing]
-    seen = _sees_skin(points[found], closed.vertex_normals[found], towards, voxels, grid, head)
-    reachable = np.zeros(len(points), dtype=bool)
-    reachable[found[seen]] = True
+    depth = head.depth_mm.ravel()[cells[found]]
+    ends = mesh.points[found] + (depth + BEYOND_MM)[:, None] * towards
+    leaves = head.depth_mm.ravel()[head.cells(ends, grid)] < AT_SKIN_MM  # not at the volume's end
+    found, towards, depth = found[leaves], towards[leaves], depth[leaves]
+    clear = _clear_of_bone(mesh.points[found], mesh.normals[found], towards, depth, voxels)
+    reachable = np.zeros(len(mesh.points), dtype=bool)
+    reachable[found[clear]] = True
     return reachable
 
 
-def _sees_skin(points: Array, normals: Array, towards: Array, voxels: BoneVoxels, grid: Grid, head: Head) -> Mask:
-    """(N,) whether the way from a bone point along `towards` leaves the head without meeting bone."""
-    origin = np.asarray(voxels.to_index(grid.to_index(points)))
-    start = float(grid.spacing_mm.max()) * normals  # clear of the voxel that the point itself lies in
-    towards_index = grid.to_index(towards) - grid.to_index(np.zeros((1, 3)))
-    origin += grid.to_index(start) - grid.to_index(np.zeros((1, 3)))
-    scale = grid.spacing_mm / head.grid.spacing_mm
-    to_head = head.grid.to_index(points + start)
-    seen = np.zeros(len(points), dtype=bool)
+def _clear_of_border(points: Floats, grid: Grid) -> Mask:
+    """(N,) whether points (grid mm) are farther than BORDER_MM from the volume's six faces."""
+    clear = np.ones(len(points), dtype=bool)
+    for axis in range(3):
+        size = (grid.shape[2 - axis] - 1) * grid.spacing_mm[2 - axis]
+        clear &= (points[:, axis] > BORDER_MM) & (points[:, axis] < size - BORDER_MM)
+    return clear
+
+
+def _clear_of_bone(points: Floats, normals: Floats, towards: Floats, depth: Floats, voxels: BoneVoxels) -> Mask:
+    """(N,) whether no bone lies between points (grid mm) and the skin, `depth` mm away along `towards`."""
+    scale = (1 / voxels.grid.spacing_mm[::-1]).astype(np.float32)
+    start = (points + np.float32(voxels.grid.spacing_mm.max()) * normals - voxels.corner_mm) * scale  # clear of its own voxel
+    step = towards * scale * np.float32(MARCH_MM)
+    steps = np.ceil(np.maximum(depth, 0) / MARCH_MM).astype(np.int32)
+    dense = voxels.hu.ravel()
+    size_k, size_j, size_i = voxels.hu.shape
+    clear = np.ones(len(points), dtype=bool)
     going = np.arange(len(points))
-    for step in np.arange(MARCH_MM, 1.5 * REACH_MM, MARCH_MM):
-        blocked = sample(voxels.hu, origin[going] + step * towards_index[going]) >= voxels.threshold_hu
-        outside = ~sample(head.mask, to_head[going] + step * towards_index[going] * scale).astype(bool)
-        seen[going[outside & ~blocked]] = True
-        going = going[~blocked & ~outside]
-        if len(going) == 0:
-            break
-    return seen
+    for number in range(1, int(steps.max(initial=0)) + 1):
+        place = np.rint(start + np.float32(number) * step).astype(np.int32)
+        within = (place >= 0).all(axis=1) & (place < (size_i, size_j, size_k)).all(axis=1)
+        place[~within] = 0  # the cut-out's border is air
+        blocked = dense[(place[:, 2] * size_j + place[:, 1]) * size_i + place[:, 0]] >= voxels.threshold_hu
+        clear[going[blocked]] = False
+        on = ~blocked & within & (steps > number)
+        going, start, step, steps = going[on], start[on], step[on], steps[on]
+    return clear
 
 
-def _large_patches(vertices: Array, triangles: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    labels = patch_labels(len(vertices), triangles)[triangles[:, 0]]
-    a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
-    areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return triangles[np.bincount(labels, areas)[labels] >= SMALLEST_PATCH_MM2]
+def _without_margins(mesh: BoneMesh, kept: Mask) -> Mask:
+    """(T,) the kept triangles without those near the edge of an opening."""
+    from scipy.spatial import cKDTree
+
+    inside, outside = np.zeros(len(mesh.points), dtype=bool), np.zeros(len(mesh.points), dtype=bool)
+    inside[mesh.triangles[kept].ravel()] = True
+    outside[mesh.triangles[~kept].ravel()] = True
+    edge = inside & outside
+    along = edge[mesh.triangles].sum(axis=1) >= 2
+    labels = patch_labels(len(mesh.points), mesh.triangles[along])
+    points, groups = mesh.points[edge], labels[edge]
+    spans = np.zeros(int(labels.max()) + 1)
+    order = np.argsort(groups, kind="stable")
+    starts = np.flatnonzero(np.diff(groups[order], prepend=-1))
+    for axis in range(3):
+        values = points[order, axis]
+        spans[groups[order][starts]] += np.maximum.reduceat(values, starts) - np.minimum.reduceat(values, starts)
+    openings = points[spans[groups] >= OPENING_MM]
+    if len(openings) == 0:
+        return kept
+    inner = np.flatnonzero(inside)
+    distance, _ = cKDTree(openings).query(mesh.points[inner], distance_upper_bound=MARGIN_MM)
+    near = np.zeros(len(mesh.points), dtype=bool)
+    near[inner[np.isfinite(distance)]] = True
+    return np.asarray(kept & ~near[mesh.triangles].any(axis=1))
 
 
-def patch_labels(vertex_count: int, triangles: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
+def _large_patches(points: Floats, triangles: Triangles) -> Triangles:
+    labels = patch_labels(len(points), triangles)[triangles[:, 0]]
+    return triangles[np.bincount(labels, triangle_areas(points, triangles))[labels] >= SMALLEST_PATCH_MM2]
+
+
+def triangle_areas(points: Floats, triangles: Triangles) -> Floats:
+    """(T,) areas, mm^2."""
+    corner = points[triangles[:, 0]]
+    u, v = points[triangles[:, 1]] - corner, points[triangles[:, 2]] - corner
+    squared = np.einsum("ij,ij->i", u, u) * np.einsum("ij,ij->i", v, v) - np.einsum("ij,ij->i", u, v) ** 2
+    areas: Floats = 0.5 * np.sqrt(np.maximum(squared, 0))
+    return areas
+
+
+def patch_labels(vertex_count: int, triangles: Triangles) -> npt.NDArray[np.int32]:
     """(V,) which connected part of a mesh each vertex belongs to."""
-    from scipy.sparse import coo_matrix
+    from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import connected_components
 
     start = np.concatenate([triangles[:, 0], triangles[:, 1]])
     end = np.concatenate([triangles[:, 1], triangles[:, 2]])
-    graph = coo_matrix((np.ones(len(start), dtype=bool), (start, end)), shape=(vertex_count, vertex_count))
+    graph = csr_matrix((np.ones(len(start), dtype=np.int8), (start, end)), shape=(vertex_count, vertex_count))
     labels: npt.NDArray[np.int32] = connected_components(graph, directed=False)[1]
     return labels
-
-
-def _compact(vertices: Array, triangles: npt.NDArray[np.int64]) -> Surface:
-    """A surface of the vertices that the triangles use."""
-    used = np.zeros(len(vertices), dtype=bool)
-    used[triangles] = True
-    number = np.cumsum(used) - 1
-    return Surface(vertices[used], number[triangles])

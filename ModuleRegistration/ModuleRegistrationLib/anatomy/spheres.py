@@ -78,15 +78,19 @@ def metal_threshold(hu: npt.NDArray[np.int16]) -> float:
     return float(np.clip(np.percentile(bone, 99) + METAL_MARGIN_HU, LOWEST_METAL_HU, HIGHEST_METAL_HU))
 
 
+def dense_voxels(hu: npt.NDArray[np.int16], threshold: float) -> npt.NDArray[np.int64]:
+    """(N, 3) subscripts of the voxels above a threshold that few exceed."""
+    index: npt.NDArray[np.int64] = np.argwhere(hu > threshold)
+    return index
+
+
 def _clusters(hu: npt.NDArray[np.int16], threshold: float, grid: Grid, diameter_mm: float) -> list[npt.NDArray[np.int64]]:
     """Index lists (n, 3) of connected voxels above the threshold whose size could be a sphere's."""
     from scipy import ndimage
 
-    rows = np.flatnonzero((hu > threshold).any(axis=2).ravel())
-    if len(rows) == 0:
+    index = dense_voxels(hu, threshold)
+    if len(index) == 0:
         return []
-    dense = np.argwhere(hu.reshape(-1, hu.shape[2])[rows] > threshold)
-    index = np.stack([rows[dense[:, 0]] // hu.shape[1], rows[dense[:, 0]] % hu.shape[1], dense[:, 1]], axis=1)
     low = index.min(axis=0)
     mask = np.zeros(tuple(index.max(axis=0) - low + 1), dtype=bool)
     mask[tuple((index - low).T)] = True
