@@ -168,8 +168,8 @@ def set_bone_points(points: BonePoints, role: str = "SurfacePoints") -> Any:
     node = set_points(role, LabelledPoints(points.labels, points.positions_mm))
     with host.slicer_package().util.NodeModify(node):
         for name, values in _point_columns(points).items():
-            _add_measurement(node, name, values)
-        _add_measurement(node, "PointId", [float(node.GetNthControlPointID(index)) for index in range(len(points))])
+            add_measurement(node, name, values)
+        add_measurement(node, "PointId", [float(node.GetNthControlPointID(index)) for index in range(len(points))])
         node.SetAttribute(SPEED, repr(float(points.speed_of_sound_m_s)))
         node.SetAttribute(SPEED_SD, repr(float(points.speed_of_sound_sd_m_s)))
         for index in range(len(points)):
@@ -189,7 +189,7 @@ def get_bone_points(role: str = "SurfacePoints", palpated_sd_mm: float | None = 
         measurements and `palpated_sd_mm` is not given.
     """
     points, node = get_points(role), _node(role)
-    columns = _read_measurements(node)
+    columns = read_measurements(node)
     if "PointId" not in columns:
         if palpated_sd_mm is None:
             raise InputError(f"{role} in the scene says nothing of its points' error; give the error of palpation in mm")
@@ -303,7 +303,8 @@ def _bone_points(points: LabelledPoints, columns: dict[str, Array], node: Any) -
     )
 
 
-def _add_measurement(node: Any, name: str, values: npt.ArrayLike) -> None:
+def add_measurement(node: Any, name: str, values: npt.ArrayLike) -> None:
+    """Keep one value (N,) a control point with a markups node; finite numbers only, JSON knows no others."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
 
     array = numpy_to_vtk(np.ascontiguousarray(values, dtype=float), deep=True)
@@ -315,7 +316,8 @@ def _add_measurement(node: Any, name: str, values: npt.ArrayLike) -> None:
     node.AddMeasurement(measurement)
 
 
-def _read_measurements(node: Any) -> dict[str, Array]:
+def read_measurements(node: Any) -> dict[str, Array]:
+    """The values (N,) a control point that a markups node keeps, by name."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     columns = {}

@@ -1,0 +1,466 @@
+"""Ultrasound as 3D Slicer sees it: module, widget, logic, self-test. Wiring only; the work stands in ModuleUltrasoundLib."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+_HERE = Path(__file__).resolve().parent
+for _folder in (_HERE, *(_HERE.parent / name for name in ("Shared", "ModuleTracking"))):
+    # In a source checkout the libraries stand in folders of their own; installed, they stand beside this file.
+    if _folder.is_dir() and str(_folder) not in sys.path:
+        sys.path.append(str(_folder))
+
+from CranioNavLib import scene, scene_data  # noqa: E402
+from CranioNavLib.errors import InputError  # noqa: E402
+from CranioNavLib.host import (  # noqa: E402
+    ScriptedLoadableModule,
+    ScriptedLoadableModuleLogic,
+    ScriptedLoadableModuleTest,
+    ScriptedLoadableModuleWidget,
+    slicer,
+)
+from CranioNavLib.module_logic import ParametersInScene, describeModule  # noqa: E402
+from CranioNavLib.panel import Level, Progress, Reading, StepState, StepStatus, Task  # noqa: E402
+from CranioNavLib.panel_model import PanelModel  # noqa: E402
+from ModuleUltrasoundLib.device import DeviceError  # noqa: E402
+from ModuleUltrasoundLib.panel_description import PANEL, UltrasoundParameters  # noqa: E402
+
+POLL_MS = 30
+LIVE_LINES = 12  # that the live depth is read from: a third of a second at 40 lines a second
+LIVE_EVERY_S = 0.2
+CURRENT_POINT = "current"  # parameter of the Protocol node: index of the point to palpate now
+NORMALS = ("Normal_R", "Normal_A", "Normal_S")  # measurements of ProtocolPoints: outward normals of the bone
+
+
+class ModuleUltrasound(ScriptedLoadableModule):
+    """What 3D Slicer's module list says."""
+
+    def __init__(self, parent=None):
+        super().__init__(parent)
+        describeModule(self.parent, "CranioNav Ultrasound", PANEL, ["ModuleTracking"])
+
+
+class ModuleUltrasoundWidget(ScriptedLoadableModuleWidget):
+    """The panel inside 3D Slicer. Lines are taken while another module is shown, too."""
+
+    def setup(self):
+        """Draw the panel."""
+        super().setup()
+        from CranioNavLib.panel_qt import show_in
+        from CranioNavLib.panel_qt_widgets import Ticker
+
+        self.logic = ModuleUltrasoundLogic()
+        self.panel = show_in(self, PanelModel(PANEL, self.logic))
+        self.ticker = Ticker(self.parent, POLL_MS, self.logic.poll)
+        self.ticker.start()
+
+    def enter(self):
+        """The user opened the module."""
+        self.panel.start()
+        self.panel.refresh()
+
+    def exit(self):
+        """The user left the module."""
+        self.panel.stop()
+
+    def cleanup(self):
+        """The module is about to be unloaded."""
+        self.ticker.stop()
+        self.logic.disconnect()
+        self.panel.close()
+
+
+class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
+    """Lines of the device and ProbeToReference of the scene in, bone points out; `poll` is called by the event loop's owner."""
+
+    parameterClass = UltrasoundParameters
+    sessionRole = "UltrasoundSession"
+    refusals = (DeviceError,)
+
+    def __init__(self, parent=None):
+        super().__init__(parent)
+        self.stream = None
+        self._poser = None
+        self._observation = None
+        self._writer = None
+        self._recordingStart = 0.0
+        self._recordedPoints = set()
+        self._latest = []  # the last posed lines
+        self._live = None  # what the last lines say: LineMeasurements
+        self._liveTime = 0.0
+        self._failure = ""
+
+    # Protocol
+
+    def planProtocol(self):
+        """Place the palpation points on the outer table; writes ProtocolPoints and Protocol. Returns a message."""
+        from CranioNavLib.slicer_files import LabelledPoints
+        from ModuleUltrasoundLib.protocol import plan_protocol
+
+        landmarks = scene_data.get_points("LandmarksCT") if self._count("LandmarksCT") else None
+        planned = plan_protocol(
+            scene_data.get_surface("OuterTable"),
+            landmarks.positions_mm if landmarks else None,
+            landmarks.labels if landmarks else None,
+        )
+        node = scene_data.set_points("ProtocolPoints", LabelledPoints(planned.labels, planned.positions_ras_mm))
+        for axis, name in enumerate(NORMALS):
+            scene_data.add_measurement(node, name, planned.normals[:, axis])
+        self._goTo(0)
+        return f"{len(planned.labels)} points"
+
+    def planProtocolBlocked(self):
+        """Why no points can be placed now."""
+        return "" if scene.find("OuterTable") is not None else "find the bone in the registration module first"
+
+    def protocolPoints(self):
+        """Positions (N, 3) in RAS, outward normals (N, 3) and labels of the planned points."""
+        import numpy as np
+
+        points = scene_data.get_points("ProtocolPoints")
+        columns = scene_data.read_measurements(scene.find("ProtocolPoints"))
+        if not all(name in columns and len(columns[name]) == len(points) for name in NORMALS):
+            raise InputError("the palpation points were edited by hand and have no normals any more; plan them again")
+        return points.positions_mm, np.stack([columns[name] for name in NORMALS], axis=1), points.labels
+
+    def nextPoint(self):
+        """Go on to the next point of the protocol."""
+        self._goTo(min(self.currentIndex() + 1, self._count("ProtocolPoints") - 1))
+
+    def nextPointBlocked(self):
+        """Why there is no next point."""
+        return "" if self._count("ProtocolPoints") else "plan the points first"
+
+    def previousPoint(self):
+        """Go back to the point before."""
+        self._goTo(max(self.currentIndex() - 1, 0))
+
+    def previousPointBlocked(self):
+        """Why there is no point before."""
+        return self.nextPointBlocked()
+
+    def currentIndex(self):
+        """Index of the point to palpate now; -1 without a protocol."""
+        node = scene.find("Protocol")
+        text = node.GetParameter(CURRENT_POINT) if node is not None else ""
+        return int(text) if text and self._count("ProtocolPoints") else -1
+
+    def _goTo(self, index):
+        scene.find_or_create("Protocol").SetParameter(CURRENT_POINT, str(index))
+
+    # Device
+
+    def connect(self):
+        """Begin to take lines from the device that the parameters name."""
+        from ModuleUltrasoundLib.line_stream import LinePoser, LineStream
+
+        device = self.createPlugin("amode", self.parameters().read().device)
+        self._failure, self._poser = "", LinePoser()
+        self._observation = scene.observe("ProbeToReference", self._takePose)
+        self.stream = LineStream(device)
+        self.stream.start()
+        return f"connecting to {device.title}"
+
+    def connectBlocked(self):
+        """Why no device can be connected now."""
+        return "disconnect first" if self.stream is not None else ""
+
+    def disconnect(self):
+        """Let go of the device."""
+        if self._writer is not None:
+            self._closeRecording()
+        if self._observation is not None:
+            self._observation.stop()
+        if self.stream is not None:
+            self.stream.stop()
+        self.stream = self._poser = self._observation = self._live = None
+        self._latest = []
+
+    def disconnectBlocked(self):
+        """Why there is nothing to disconnect."""
+        return self._notConnected()
+
+    def poll(self):
+        """Take over the lines that came since the last call. Main thread only."""
+        if self.stream is None:
+            return
+        try:
+            lines = self.stream.poll()
+        except InputError as error:
+            self.disconnect()
+            self._failure = str(error)
+            raise
+        for line in lines:
+            self._poser.add_line(line, self.currentIndex())
+        posed = self._poser.ready()
+        if self._writer is not None:
+            for item in posed:
+                self._record(item)
+        self._latest = (self._latest + posed)[-LIVE_LINES:]
+        self._showLive()
+
+    def _takePose(self, node):
+        pose = scene_data.get_pose("ProbeToReference")
+        if pose.host_time_s == pose.host_time_s and self._poser is not None:
+            self._poser.add_pose(pose.matrix, pose.status, pose.host_time_s)
+
+    def _showLive(self):
+        """The last line as a table, and what the last lines say of the depth; a few times a second."""
+        import time
+
+        from ModuleUltrasoundLib.line_stream import recording_of
+        from ModuleUltrasoundLib.measure import measure_lines
+
+        now = time.monotonic()
+        if not self._latest or now < self._liveTime + LIVE_EVERY_S:
+            return
+        self._liveTime = now
+        samples, rate = self._latest[-1].line.samples, self.stream.acquisition.sampling_hz
+        scene_data.set_table("ALine", {"time (µs)": (1e6 / rate * _indices(samples)).tolist(), "amplitude": samples.tolist()})
+        self._live = measure_lines(recording_of(self._latest, self.stream.acquisition), self.parameters().read().echo_settings())
+
+    # Recording
+
+    def startRecording(self):
+        """Record every line with its pose into `recording_path`. Returns a message."""
+        from CranioNavLib.sequence_metafile import RecordingWriter
+
+        path = self.parameters().read().recording_path
+        first = self._latest[-1].line
+        self._recordingStart, self._recordedPoints = first.host_time_s, set()
+        self._writer = RecordingWriter(path, len(first.samples), self.stream.acquisition)
+        return f"recording into {path}"
+
+    def startRecordingBlocked(self):
+        """Why nothing can be recorded now."""
+        if self._writer is not None:
+            return "already recording"
+        if not self._latest:
+            return self._notConnected() or "no line has come yet"
+        return "" if self.parameters().read().recording_path else "choose a file first"
+
+    def stopRecording(self):
+        """Finish the file and measure it."""
+        self._closeRecording()
+        return self.measureRecording()
+
+    def stopRecordingBlocked(self):
+        """Why there is no recording to stop."""
+        return "" if self._writer is not None else "not recording"
+
+    def _closeRecording(self):
+        for item in self._poser.ready(everything=True):
+            self._record(item)
+        self._writer.close()
+        self._writer = None
+
+    def _record(self, item):
+        if item.line.host_time_s <= self._recordingStart and self._writer.count:
+            return
+        pose = item.pose
+        self._writer.append(
+            max(0.0, item.line.host_time_s - self._recordingStart),
+            {"ProbeToReference": pose.tool_to_tracker if pose.usable else None},
+            {"ProbeToReference": "OK" if pose.usable else ("MISSING" if pose.status.value == "STALE" else pose.status.value)},
+            item.line.samples,
+            item.palpation_point,
+        )
+        if pose.usable:
+            self._recordedPoints.add(item.palpation_point)
+
+    # Bone points
+
+    def measureRecording(self):
+        """Find the bone in every line of `recording_path`; good ones become SurfacePoints."""
+        from CranioNavLib.sequence_metafile import read_recording
+        from ModuleUltrasoundLib.measure import bone_points, measure_lines
+
+        wanted = self.parameters().read()
+
+        def measure(progress: Progress):
+            progress("reading the recording", 0.05)
+            recording = read_recording(wanted.recording_path)
+            progress("looking for the bone echo", 0.2)
+            measured = measure_lines(recording, wanted.echo_settings())
+            return bone_points(recording, measured), int(measured.accepted.sum()), len(measured)
+
+        def take(found):
+            points, accepted, lines = found
+            scene_data.set_bone_points(points)
+            return f"{len(points)} bone points from {accepted} of {lines} lines"
+
+        return Task("Measure recording", measure, take)
+
+    def measureRecordingBlocked(self):
+        """Why nothing can be measured now."""
+        if self._writer is not None:
+            return "stop the recording first"
+        return "" if self.parameters().read().recording_path else "choose a recording first"
+
+    # What the panel shows
+
+    def connection(self):
+        """Connected, or why not."""
+        if self.stream is None:
+            return Reading(self._failure or "not connected", Level.BAD if self._failure else Level.PLAIN)
+        state = self.stream.state
+        return Reading(state.problem or f"{state.lines} lines", Level.GOOD if state.connected else Level.WARNING)
+
+    def probePose(self):
+        """Whether the scene has a live pose of the probe."""
+        status = scene_data.get_pose("ProbeToReference").status
+        return Reading(status, Level.GOOD if status == "OK" else Level.BAD)
+
+    def depth(self):
+        """The bone's depth under the probe now; None while there is no trustworthy echo."""
+        if self._live is None or not len(self._live):
+            return None
+        if not self._live.accepted[-1]:
+            return Reading(self._live.reasons[-1], Level.WARNING)
+        return Reading(f"{self._live.depths_mm[-1]:.2f}", Level.GOOD)
+
+    def quality(self):
+        """Probability that the depth is right to half a millimetre."""
+        if self._live is None or not len(self._live):
+            return None
+        value = float(self._live.qualities[-1])
+        good = value >= self.parameters().read().quality_gate
+        return Reading(f"{value:.2f}", Level.GOOD if good else Level.WARNING)
+
+    def currentPoint(self):
+        """The point to palpate now."""
+        index = self.currentIndex()
+        if index < 0:
+            return None
+        return Reading(f"{index + 1}. {scene.find('ProtocolPoints').GetNthControlPointLabel(index)}")
+
+    def recorded(self):
+        """How much has been recorded."""
+        if self._writer is None:
+            return None
+        return Reading(f"{self._writer.count} lines at {len(self._recordedPoints)} points")
+
+    def pointCount(self):
+        """How many bone points there are."""
+        count = self._count("SurfacePoints")
+        return Reading(str(count)) if count else None
+
+    def protocolStatus(self):
+        """Whether the points are planned."""
+        done = self._count("ProtocolPoints") > 0
+        return StepStatus(
+            StepState.DONE if done else StepState.TODO, "" if done else self.planProtocolBlocked() or "plan the points"
+        )
+
+    def deviceStatus(self):
+        """Whether lines arrive."""
+        if self.stream is None:
+            return StepStatus(StepState.ATTENTION if self._failure else StepState.TODO, self._failure or "connect the device")
+        state = self.stream.state
+        return StepStatus(StepState.DONE if state.connected else StepState.ATTENTION, state.problem)
+
+    def palpationStatus(self):
+        """Whether something is being or has been recorded."""
+        if self._writer is not None:
+            return StepStatus(StepState.ATTENTION, "recording; stop when all points are palpated")
+        done = Path(self.parameters().read().recording_path).is_file()
+        return StepStatus(StepState.DONE if done else StepState.TODO, "" if done else self.startRecordingBlocked() or "record")
+
+    def measureStatus(self):
+        """Whether there are bone points."""
+        done = self._count("SurfacePoints") > 0
+        return StepStatus(
+            StepState.DONE if done else StepState.TODO, "" if done else self.measureRecordingBlocked() or "measure the recording"
+        )
+
+    def _count(self, role):
+        node = scene.find(role)
+        return node.GetNumberOfControlPoints() if node is not None else 0
+
+    def _notConnected(self):
+        return "" if self.stream is not None else "connect the device first"
+
+
+def _indices(samples):
+    import numpy as np
+
+    return np.arange(len(samples))
+
+
+class ModuleUltrasoundTest(ScriptedLoadableModuleTest):
+    """Simulated probe and tracker on a virtual patient: the recorded lines become bone points that lie on the bone."""
+
+    POINTS = 3
+    LARGEST_DISTANCE_MM = 2.0  # simulated: depth error at an unknown speed of sound, and the tracker's own
+    SECONDS_A_POINT = 2.5  # of which the hand takes one to get there
+
+    def setUp(self):
+        """A fresh scene and a simulated patient of its own."""
+        from CranioNavLib.phantom import make_patient
+        from CranioNavLib.phantom.session import SimulatedSession, use_session
+
+        slicer.mrmlScene.Clear(False)
+        self.session = SimulatedSession(make_patient(None, seed=2), seed=2)
+        use_session(self.session)
+        self.logic = ModuleUltrasoundLogic()
+
+    def tearDown(self):
+        """Let go of the device."""
+        from CranioNavLib.phantom.session import use_session
+
+        self.logic.disconnect()
+        use_session(None)
+
+    def runTest(self):
+        """The scenario."""
+        self.setUp()
+        try:
+            self.test_palpation_becomes_bone_points()
+        finally:
+            self.tearDown()
+
+    def test_palpation_becomes_bone_points(self):
+        """Plan, connect, palpate three points, stop: SurfacePoints lie on the patient's bone."""
+        import tempfile
+
+        from CranioNavLib.rigid import transform_points
+        from CranioNavLib.slicer_files import LabelledPoints
+        from ModuleTrackingLib.pose_stream import PoseStream
+        from ModuleTrackingLib.tracker import TRACKERS
+
+        patient, logic = self.session.patient, self.logic
+        scene_data.set_surface("OuterTable", patient.bone)
+        scene_data.set_points("LandmarksCT", LabelledPoints(patient.landmark_labels, patient.landmarks_ras_mm))
+        self.delayDisplay(logic.planProtocol())
+        positions, normals, _ = logic.protocolPoints()
+        self.session.set_plan(positions, normals)
+        with tempfile.TemporaryDirectory() as folder, PoseStream(TRACKERS.create("simulated", rate_hz="60")) as poses:
+            logic.parameters().change(device="simulated", recording_path=f"{folder}/palpation.igs.mha")
+            logic.connect()
+            self.session.hold_probe_at(0)
+            self._run(poses, self.SECONDS_A_POINT)
+            logic.startRecording()
+            for index in range(self.POINTS):
+                self.session.hold_probe_at(index)
+                self._run(poses, self.SECONDS_A_POINT)
+                logic.nextPoint()
+            self.delayDisplay(logic.stopRecording().run())
+        points = scene_data.get_bone_points("SurfacePoints")
+        assert len(points) >= self.POINTS, f"{len(points)} points from {self.POINTS} places"
+        in_ras = transform_points(patient.true_reference_to_ras, points.positions_mm)
+        distances = patient.bone.closest(in_ras).distances_mm
+        assert distances.max() < self.LARGEST_DISTANCE_MM, f"a bone point lies {distances.max():.2f} mm from the bone"
+
+    def _run(self, poses, seconds):
+        """The event loop, for some seconds: the tracking module's part writes the probe's pose, ours reads it."""
+        import time
+
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            for frame in poses.poll():
+                time_s = frame[0].host_time_s
+                pose = poses.in_reference_at("Probe", time_s)
+                scene_data.set_pose("ProbeToReference", pose.tool_to_reference, pose.status.value, time_s)
+            self.logic.poll()
+            time.sleep(POLL_MS / 1000)

@@ -1,0 +1,104 @@
+"""The ultrasound panel and its parameters, as data: drawn by Qt inside 3D Slicer and in the browser."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from CranioNavLib.panel import Action, FileField, NodeField, Panel, ParameterField, PluginField, ReadOut, Step
+from CranioNavLib.parameters import Limits, Parameters
+
+from ModuleUltrasoundLib.device import AMODE_DEVICES
+from ModuleUltrasoundLib.measure import EchoSettings
+
+RECORDINGS = ("Recording (*.igs.mha *.igs.mhd *.mha)",)
+
+
+@dataclass(frozen=True)
+class UltrasoundParameters(Parameters):
+    """What the ultrasound module keeps in the scene."""
+
+    device: Annotated[str, "where RF lines come from"] = "simulated"
+    recording_path: Annotated[str, "recording to be measured, or to be written (.igs.mha)"] = ""
+    speed_of_sound_m_s: Annotated[float, Limits(1300, 1800), "speed of sound in the scalp: mean of the prior"] = (
+        EchoSettings.speed_of_sound_m_s
+    )
+    speed_of_sound_sd_m_s: Annotated[float, Limits(0, 200), "speed of sound in the scalp: SD of the prior"] = (
+        EchoSettings.speed_of_sound_sd_m_s
+    )
+    most_depth_mm: Annotated[float, Limits(2, 60), "no bone is looked for below this depth"] = EchoSettings.most_depth_mm
+    quality_gate: Annotated[float, Limits(0, 1), "lines below this quality are not points"] = EchoSettings.quality_gate
+
+    def echo_settings(self) -> EchoSettings:
+        """The settings of the signal chain."""
+        return EchoSettings(
+            speed_of_sound_m_s=self.speed_of_sound_m_s,
+            speed_of_sound_sd_m_s=self.speed_of_sound_sd_m_s,
+            most_depth_mm=self.most_depth_mm,
+            quality_gate=self.quality_gate,
+        )
+
+
+PANEL = Panel(
+    module="ModuleUltrasound",
+    title="A-mode ultrasound",
+    parameters=UltrasoundParameters,
+    steps=(
+        Step(
+            name="protocol",
+            title="Protocol",
+            help="Place the 18 palpation points on this skull, from its outer table and the planned landmarks.",
+            items=(
+                NodeField("OuterTable", "Outer table"),
+                NodeField("LandmarksCT", "Landmarks in the CT"),
+                Action("planProtocol", "Plan points", "Place the palpation points", primary=True),
+                ReadOut("currentPoint", "Palpate now", large=True),
+                Action("nextPoint", "Next", "Go on to the next point", shortcut="Right"),
+                Action("previousPoint", "Back", "Go back to the point before", shortcut="Left"),
+            ),
+            status="protocolStatus",
+        ),
+        Step(
+            name="device",
+            title="Probe",
+            help="Choose the pulser/receiver and connect. The probe's pose comes from the tracking module.",
+            items=(
+                PluginField("device", "Device", AMODE_DEVICES.kind),
+                Action("connect", "Connect", "Begin to take lines", primary=True),
+                Action("disconnect", "Disconnect", "Let go of the device"),
+                ReadOut("connection", "Connection"),
+                ReadOut("probePose", "Probe's pose"),
+                ReadOut("depth", "Bone depth", "mm", large=True),
+                ReadOut("quality", "Echo quality (0..1)"),
+            ),
+            status="deviceStatus",
+        ),
+        Step(
+            name="palpation",
+            title="Palpation",
+            help="Hold the probe still on each point, or sweep it slowly; every line is recorded.",
+            items=(
+                FileField("recording_path", "Recording", RECORDINGS, save=True),
+                Action("startRecording", "Record", "Begin to record lines and poses", primary=True),
+                Action("stopRecording", "Stop", "Finish the file and measure it"),
+                ReadOut("recorded", "Recorded"),
+            ),
+            status="palpationStatus",
+        ),
+        Step(
+            name="measure",
+            title="Bone points",
+            help="Find the bone echo in every recorded line; good ones become bone points with their error.",
+            items=(
+                ParameterField("speed_of_sound_m_s"),
+                ParameterField("speed_of_sound_sd_m_s"),
+                ParameterField("most_depth_mm"),
+                ParameterField("quality_gate"),
+                Action("measureRecording", "Measure recording", "Read the recording and write SurfacePoints", primary=True),
+                NodeField("SurfacePoints", "Bone points"),
+                ReadOut("pointCount", "Points"),
+            ),
+            status="measureStatus",
+        ),
+    ),
+)
