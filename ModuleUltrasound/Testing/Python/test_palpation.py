@@ -64,7 +64,7 @@ def test_the_best_line_of_the_dwell_is_kept():
 def test_among_equally_sure_lines_the_middle_one_is_kept():
     palpation = Palpation(LABELS)
     for k in range(11):
-        palpation.add(a_line(k * 0.05, (0.8 * np.sign(k - 5) if k != 5 else 0.0, 0, 0), frame=k))
+        palpation.add(a_line(k * 0.05, (0.4 * np.sign(k - 5), 0, 0), frame=k))
     assert palpation.taken[0].line.frame == 5
 
 
@@ -104,9 +104,9 @@ def test_a_gap_begins_the_dwell_anew():
 def test_single_bad_lines_do_not_break_a_dwell():
     palpation = Palpation(LABELS)
     for k in range(11):
-        palpation.add(a_line(k * 0.05, accepted=k % 3 != 1, reason="no echo"))
+        palpation.add(a_line(k * 0.05, accepted=k % 3 != 2, reason="no echo"))
     assert len(palpation.taken) == 1
-    assert palpation.refused == {"no echo": 4}
+    assert palpation.refused == {"no echo": 3}
 
 
 def test_few_lines_are_not_a_dwell_however_long():
@@ -207,11 +207,7 @@ def test_a_sweep_is_thinned_to_an_even_density():
     nearest = gaps.min(axis=1)
     assert np.quantile(nearest, 0.9) < 4.0
     assert len(sweep) > 100
-    assert (
-        sweep.refused["near a point already kept"]
-        == 4000 - len(sweep) - sum(count for reason, count in sweep.refused.items() if reason != "near a point already kept")
-        or len(sweep) + sum(sweep.refused.values()) <= 4000
-    )
+    assert sweep.refused["near a point already kept"] > 2000
 
 
 def test_of_two_lines_in_one_place_the_surer_stays():
