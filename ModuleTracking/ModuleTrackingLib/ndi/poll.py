@@ -25,6 +25,7 @@ OPTIONS = TRANSFORMS | TOOL_INFO | REPORT_OUT_OF_VOLUME
 FAILURES_FOR_LOSS = 3
 LOST_AFTER_S = 0.5  # damaged replies for this long, and at least three of them
 WRAP = 2**32
+FRAMES_TO_LEARN, KEPT_FRAMES = 16, 60  # for the pace of frames
 FENCE_S = 0.2
 NO_TOOL_S = 0.02  # pace of polling while every handle is disabled or unplugged
 BYTES_A_TOOL = {True: 53, False: 94}  # BX, TX, with tool information
@@ -35,8 +36,9 @@ class FrameClock:
 
     def __init__(self) -> None:
         self.count = -1  # of the newest frame, unwrapped
-        self._steps: list[tuple[int, float]] = []  # recent frames: count, host time
-        self._lead = 0.05  # how much before the next frame is due the poll goes out, as a share of the period
+        self._recent: list[tuple[int, float]] = []  # frames: count, host time
+        self._step = 0  # smallest difference of frame numbers
+        self._lead = 0.25  # how much before the next frame is due the poll goes out, as a share of the period
 
     def unwrap(self, frame: int) -> int:
         """The count of a 32-bit frame number, the one nearest to the newest frame."""
@@ -46,25 +48,27 @@ class FrameClock:
 
     def note(self, count: int, at_s: float, polls: int) -> None:
         """A new frame came at `at_s` after so many polls."""
+        change = -0.005 if polls > 1 else 0.005  # met at the first poll: go a little earlier
+        if self._step and count - self.count > self._step:
+            change = 0.05  # a frame was missed
+        self._lead = min(0.4, max(0.0, self._lead + change))
         self.count = count
-        self._steps = [*self._steps[-40:], (count, at_s)]
-        change = -0.002 if polls > 1 else 0.002  # met at the first poll: go a little earlier
-        self._lead = min(0.3, max(0.0, self._lead + change))
+        self._recent = [*self._recent[-KEPT_FRAMES:], (count, at_s)]
+        self._step = min((b[0] - a[0] for a, b in zip(self._recent, self._recent[1:])), default=0)
 
     @property
     def period_s(self) -> float:
         """Time from frame to frame as seen on this host; 0 while it is not known."""
-        if len(self._steps) < 8:
+        if len(self._recent) < FRAMES_TO_LEARN:
             return 0.0
-        (first, since_s), (last, until_s) = self._steps[0], self._steps[-1]
-        step = min(b[0] - a[0] for a, b in zip(self._steps, self._steps[1:]))
-        return step * (until_s - since_s) / max(1, last - first)
+        (first, since_s), (last, until_s) = self._recent[0], self._recent[-1]
+        return self._step * (until_s - since_s) / (last - first)
 
     def wait_s(self, now_s: float) -> float:
         """How long to wait before the next poll after a new frame."""
-        if not self._steps or self.period_s == 0.0:
+        if not self.period_s:
             return 0.0
-        return max(0.0, self._steps[-1][1] + (1.0 - self._lead) * self.period_s - now_s)
+        return max(0.0, self._recent[-1][1] + (1.0 - self._lead) * self.period_s - now_s)
 
     def retry_s(self) -> float:
         """How long to wait after a poll that brought nothing new."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Optional
@@ -47,7 +48,12 @@ RESET_TAKES_S = 7.0  # from break to the RESET message, at most
 LISTEN_FOR_RESET_S = 0.5
 BACK_OFF_S = (0.05, 0.1, 0.2, 0.3)  # between attempts to open a port that is gone
 FIRST_PATIENCE_S, LONGEST_PATIENCE_S = 1.0, 8.0
+SLOW_COMMANDS, QUICK_SHARE = ("INIT", "PINIT", "TSTART", "SET"), 0.3  # share of the patience that other commands get
 ROUNDS_OF_PINIT = 3
+REPEATS = 8  # of a command whose answers come damaged
+LATE_S = 0.05
+NO_SUCH_HANDLE = (0x08, 0x2B)
+_REVISION = re.compile(rb"[A-Z]\.\d{3}\.\d{3}")
 
 
 class SetUpError(Exception):
@@ -222,12 +228,15 @@ class Session:
     def _answers(self) -> Script[bool]:
         """Whether a device answers at the present speed."""
         try:
-            yield Ask(PROBE, PROBE_S)
+            answer: Answer = yield Ask(PROBE, PROBE_S)
+            if not _REVISION.fullmatch(answer.data):
+                yield Hush(LATE_S)  # RESET, or an earlier command's answer: the probe's own is still to come
         except DeviceError:
-            return True
+            pass
         except (SilenceError, DamagedReplyError):
             yield Hush()
             return False
+        self._last_break_s = float("-inf")
         return True
 
     def _initialise(self) -> Script[None]:
@@ -253,6 +262,7 @@ class Session:
             if not (yield from self._port_takes(speed)):
                 continue
             self.say("setting up", f"changing to {speed} baud")
+            self.working_speed = speed  # where the search meets the device if the answer is lost
             try:
                 check_okay((yield Ask(f"COMM:{code}0000", self._time_for(20))).data)
             except DeviceError as error:
@@ -268,7 +278,6 @@ class Session:
                 if (yield from self._answers()):
                     return
             self._speed_failures[speed] = self._speed_failures.get(speed, 0) + 1
-            self.working_speed = speed  # where the search meets it if only the cable was out
             raise SilenceError(f"no answer at {speed} baud")
 
     def _port_takes(self, speed: int) -> Script[bool]:
@@ -289,7 +298,7 @@ class Session:
 
     def _set_up(self) -> Script[None]:
         for entry in parse_phsr((yield from self._tell("PHSR:01"))):
-            yield from self._okay(f"PHF:{entry.handle:02X}")
+            yield from self._free(entry.handle)
         if self.plan.volume is not None:
             yield from self._okay(f"SET:Param.Tracking.Selected Volume={self.plan.volume}")
         yield from self._ask_parameters()
@@ -321,11 +330,28 @@ class Session:
         ours: dict[int, ToolFile] = {}
         for tool in self.plan.tool_files:
             self.say("setting up", f"sending {tool.source}")
-            handle = parse_handle((yield from self._tell("PHRQ:*********1****", repeat=False)))
+            handle = yield from self._new_handle(set(ours))
             ours[handle] = tool
             for address, chunk in rom_chunks(tool.rom):
                 yield from self._okay(pvwr_command(handle, address, chunk))
         return ours
+
+    def _new_handle(self, ours: set[int]) -> Script[int]:
+        """A handle for a tool file. If its number is lost on the way, whatever was given out is given back first."""
+        while True:
+            try:
+                return parse_handle((yield from self._tell("PHRQ:*********1****", repeat=False)))
+            except (DamagedReplyError, BadReplyError):
+                for entry in parse_phsr((yield from self._tell("PHSR:02"))):
+                    if entry.handle not in ours:
+                        yield from self._free(entry.handle)
+
+    def _free(self, handle: int) -> Script[None]:
+        try:
+            yield from self._okay(f"PHF:{handle:02X}")
+        except DeviceError as error:
+            if error.code not in NO_SUCH_HANDLE:
+                raise
 
     def _initialise_tools(self, ours: dict[int, ToolFile]) -> Script[None]:
         for _ in range(ROUNDS_OF_PINIT):
@@ -374,19 +400,27 @@ class Session:
         Some commands take seconds, and a pulled cable must be noticed sooner. So patience is short at first;
         when it ends, a device that still answers a probe gets the command again, with more patience.
         """
+        damaged = 0
         while True:
             asked_s = self.now()
             try:
-                answer: Answer = yield Ask(command, self._patience_s + self._time_for(len(command) + 40))
-                self._slowest_s = max(self._slowest_s, answer.at_s - asked_s)
+                share = 1.0 if command.startswith(SLOW_COMMANDS) else QUICK_SHARE
+                answer: Answer = yield Ask(command, share * self._patience_s + self._time_for(len(command) + 40))
+                self._slowest_s = max(self._slowest_s, (answer.at_s - asked_s) / share)
                 return answer.data
             except DeviceError as error:
                 if error.code != 0x04 or not repeat:  # 04: the command was damaged on its way
                     raise
-            except (SilenceError, DamagedReplyError) as error:
+            except DamagedReplyError as error:
+                damaged += 1
+                yield Hush()
+                if not repeat or damaged > REPEATS:
+                    raise
+                self.say("setting up", f"{error}; asking again")
+            except SilenceError as error:
                 self._patience_s = min(LONGEST_PATIENCE_S, 2.0 * self._patience_s)
                 yield Hush()
-                if not repeat or not (yield from self._answers()):
+                if not repeat or not ((yield from self._answers()) or (yield from self._answers())):
                     raise
                 self.say("setting up", f"{error}; asking again")
 

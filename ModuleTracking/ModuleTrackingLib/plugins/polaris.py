@@ -165,7 +165,7 @@ class PolarisTracker(Tracker):
                 self._try_to(self._session.leave())
             self._conductor.drop()
             self._conductor.close_port()
-        self._conductor = self._session = self._poller = None
+        self._conductor = self._session = None
         if self.state is not PolarisState.DISCONNECTED:
             self._go(PolarisState.DISCONNECTED, "")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import zlib
+import hashlib
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -93,8 +93,8 @@ class Faults:
         if name not in self.active:
             return False
         share = self.active[name][0]
-        mark = zlib.crc32(f"{self.seed} {name} {tool} {int(time_s / WINDOW_S)}".encode())
-        return mark / 2**32 < share
+        what = f"{self.seed} {name} {tool} {int(time_s / WINDOW_S)}".encode()
+        return int.from_bytes(hashlib.blake2b(what, digest_size=4).digest(), "big") / 2**32 < share
 
     def cable_out(self, time_s: float) -> bool:
         """Whether the cable is out at this time."""

@@ -53,7 +53,7 @@ class LoopbackPort:
         until_s = self.clock.now() + timeout_s
         while True:
             self._check()
-            self.pending += self.station.take_due(self.clock.now())
+            self.pending += self.station.take_due(self.clock.now(), self.speed)
             if self.pending:
                 data, self.pending = self.pending, b""
                 return data
@@ -66,7 +66,7 @@ class LoopbackPort:
     def flush_input(self) -> None:
         """See Port.flush_input."""
         self._check()
-        self.station.take_due(self.clock.now())
+        self.station.take_due(self.clock.now(), self.speed)
         self.pending = b""
 
     def set_speed(self, baud: int) -> None:

@@ -226,7 +226,7 @@ def serve(
         data = line.read(ready)
         if data:
             station.receive(data, line.host_speed(), now)
-        due = station.take_due(time.monotonic())
+        due = station.take_due(time.monotonic(), line.host_speed())
         if due:
             line.write(due)
 

@@ -19,19 +19,17 @@ class Station:
 
     def __init__(self, device: EmulatedPolaris, paced: bool = False) -> None:
         self.device, self.faults, self.paced = device, device.faults, paced
-        self._waiting: list[tuple[float, int, bytes]] = []
+        self._waiting: list[tuple[float, int, bytes, int]] = []  # due, order, bytes, speed
         self._sent = 0
         self._line_free_s = 0.0
         self._brown_outs = 0
         self._started_s: Optional[float] = None
         self._unplugged_until_s = 0.0
-        self._host_speed: Optional[int] = None
 
     def receive(self, data: bytes, host_speed: Optional[int], now_s: float) -> None:
         """Bytes from the host, sent at `host_speed` (None: a line without speeds)."""
-        self._host_speed = host_speed
         self.tick(now_s)
-        if self.cable_out(now_s) or self._mismatch(host_speed):
+        if self.cable_out(now_s) or host_speed not in (None, self.device.speed):
             return
         speed = self.device.speed
         for reply in self.device.receive(data, now_s):
@@ -48,16 +46,15 @@ class Station:
             self._waiting.clear()
         self._brown_outs = brown_outs
         for message in self.device.booted(now_s):
-            if self._mismatch(self._host_speed):
-                message = garble(message, self.faults.rng)
             self._send(message, now_s, self.device.speed)
 
-    def take_due(self, now_s: float) -> bytes:
-        """What reaches the host now."""
+    def take_due(self, now_s: float, host_speed: Optional[int] = None) -> bytes:
+        """What reaches the host now; noise, where it listens at another speed."""
         self.tick(now_s)
         data = b""
         while self._waiting and self._waiting[0][0] <= now_s:
-            data += heapq.heappop(self._waiting)[2]
+            _, _, piece, speed = heapq.heappop(self._waiting)
+            data += piece if host_speed in (None, speed) else garble(piece, self.faults.rng)
         return b"" if self.cable_out(now_s) else data
 
     def wakes_at_s(self) -> Optional[float]:
@@ -103,16 +100,13 @@ class Station:
             return f"refused: {error}"
         return f"done: {line.strip()}"
 
-    def _mismatch(self, host_speed: Optional[int]) -> bool:
-        return host_speed is not None and host_speed != self.device.speed
-
     def _send(self, data: bytes, when_s: float, speed: int) -> None:
         if self.paced:
             when_s = max(when_s, self._line_free_s) + len(data) * BITS_A_BYTE / speed
             self._line_free_s = when_s
         self._sent += 1
         if data:
-            heapq.heappush(self._waiting, (when_s, self._sent, data))
+            heapq.heappush(self._waiting, (when_s, self._sent, data, speed))
 
 
 def make_faults(specs: list[str], seed: int = 0) -> Faults:
