@@ -64,14 +64,24 @@ def head_region(volume: Volume) -> npt.NDArray[np.bool_]:
     if body.sum() * float(np.prod(spacing)) < SMALLEST_HEAD_MM3:
         raise InputError("the CT holds no head: its largest body is smaller than half a litre; give a CT of a whole head")
     radius = max(1, round(constants.NOSE_AND_EAR_SEAL_MM / 2 / float(spacing[0])))
-    disc = np.hypot(*np.mgrid[-radius : radius + 1, -radius : radius + 1]) <= radius
-    filled = np.empty_like(body)
-    for index, section in enumerate(body):
-        padded = np.pad(section, radius + 1)
-        sealed = ndimage.binary_fill_holes(ndimage.binary_closing(padded, disc))
-        filled[index] = sealed[radius + 1 : -radius - 1, radius + 1 : -radius - 1]
+    box = ndimage.find_objects(body)[0]
+    filled = np.zeros_like(body)
+    filled[box] = np.stack([_sealed(section, radius) for section in body[box]])
     region: npt.NDArray[np.bool_] = filled
     return region
+
+
+def _sealed(section: npt.NDArray[np.bool_], radius: int) -> npt.NDArray[np.bool_]:
+    """An axial section of the body with openings narrower than 2 * radius pixels closed, and what lies inside filled."""
+    from scipy import ndimage
+
+    padded = np.pad(section, 2 * radius + 1)
+    grown = ndimage.distance_transform_edt(~padded) <= radius
+    closed = ndimage.distance_transform_edt(grown) > radius
+    outside, _ = ndimage.label(~(closed | padded))
+    inner = slice(2 * radius + 1, -2 * radius - 1)
+    filled: npt.NDArray[np.bool_] = (outside != outside[0, 0])[inner, inner]
+    return filled
 
 
 def _grow(mask: npt.NDArray[np.bool_], voxels: int) -> npt.NDArray[np.bool_]:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from CranioNavLib.rigid import Array
 from CranioNavLib.volume import Volume
 
-SPACING_MM = 1.0
+SPACING_MM = 1.2
 HALF_EXTENT_MM = (98.0, 118.0, 104.0)  # right, front, top
 SEMI_AXES_MM = (72.0, 90.0, 82.0)  # outer table: right, front, top; adult neurocranium about 145 x 180 mm
 
@@ -49,7 +49,7 @@ GRID_DEG = 0.5
 
 
 def synthetic_head() -> tuple[Volume, Array]:
-    """The head as a CT of 1 mm voxels, and its four landmarks near the bone (4, 3), RAS mm. Always the same."""
+    """The head as a CT of 1.2 mm voxels, and its four landmarks near the bone (4, 3), RAS mm. Always the same."""
     half = np.array(HALF_EXTENT_MM)
     counts = np.round(2 * half / SPACING_MM).astype(int) + 1
     ijk_to_ras = np.diag([-SPACING_MM, -SPACING_MM, SPACING_MM, 1.0])
