@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import gzip
 import importlib
+import math
 import struct
+import zlib
 from pathlib import Path
 from typing import Any, Optional
 
@@ -162,21 +164,35 @@ def _require_orientation(path: Path) -> None:
     try:
         if name.endswith((".nrrd", ".nhdr")):
             with path.open("rb") as file:
-                header = file.read(65536).split(b"\n\n")[0].split(b"\r\n\r\n")[0]
-            if header.startswith(b"NRRD") and b"space:" not in header.lower():
+                header = file.read(65536).split(b"\n\n")[0].split(b"\r\n\r\n")[0].lower()
+            if header.startswith(b"nrrd") and b"dimension: 3" in header and b"space:" not in header:
                 raise InputError(f"{path} does not say how it lies in the patient (no 'space' field); export it from DICOM again")
         elif name.endswith((".nii", ".nii.gz")):
-            with gzip.open(path, "rb") if name.endswith(".gz") else path.open("rb") as file:
-                head = file.read(348)
-            order = "<" if head[:4] == struct.pack("<i", 348) else ">"
-            if len(head) == 348 and 348 in struct.unpack("<i", head[:4]) + struct.unpack(">i", head[:4]):
-                qform, sform = struct.unpack(order + "hh", head[252:256])
-                if qform <= 0 and sform <= 0:
-                    raise InputError(
-                        f"{path} does not say how it lies in the patient (qform and sform codes are 0); convert it again"
-                    )
-    except (OSError, EOFError) as error:
+            _check_nifti(path)
+    except (OSError, EOFError, zlib.error) as error:
         raise InputError(f"cannot read {path}: {error}; export the CT again") from None
+
+
+def _check_nifti(path: Path) -> None:
+    """Refuse a NIfTI-1 file without orientation, and one that is cut off: ITK fills a cut .nii.gz with zeros."""
+    packed = path.name.lower().endswith(".gz")
+    with gzip.open(path, "rb") if packed else path.open("rb") as file:
+        head = file.read(348)
+    order = next((sign for sign in "<>" if head[:4] == struct.pack(sign + "i", 348)), None)
+    if order is None or len(head) < 348:
+        return  # NIfTI-2 or none at all: left to the reader
+    qform, sform = struct.unpack(order + "hh", head[252:256])
+    if qform <= 0 and sform <= 0:
+        raise InputError(f"{path} does not say how it lies in the patient (qform and sform codes are 0); convert it again")
+    dimensions = struct.unpack(order + "8h", head[40:56])
+    (bits,) = struct.unpack(order + "h", head[72:74])
+    (offset,) = struct.unpack(order + "f", head[108:112])
+    needed = int(offset) + math.prod(max(1, n) for n in dimensions[1 : dimensions[0] + 1]) * bits // 8
+    with path.open("rb") as file:
+        file.seek(-4 if packed else 0, 2)
+        held = struct.unpack("<I", file.read(4))[0] if packed else file.tell()  # gzip ends with the unpacked size
+    if not needed % 2**32 <= held <= needed % 2**32 + 2**20:  # a cut .nii.gz ends with four bytes that mean nothing
+        raise InputError(f"{path} is cut off: it does not hold the {needed} bytes that its header announces; copy it again")
 
 
 def _reason(error: Exception) -> str:

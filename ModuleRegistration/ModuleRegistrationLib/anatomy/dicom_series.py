@@ -91,8 +91,11 @@ def _read_headers(folder: Path) -> list[Slice]:
             raise InputError(f"cannot read {item}: {error.strerror or error}; check the folder's permissions") from None
         except Exception as error:
             raise InputError(f"{item} is damaged ({type(error).__name__}); copy the series again") from None
-        if header.get("SOPClassUID", "") != DIRECTORY_CLASS and item.name.upper() != "DICOMDIR":
-            found.append(Slice(item, header, offset))
+        if item.name.upper() == "DICOMDIR" or header.get("SOPClassUID", "") == DIRECTORY_CLASS:
+            continue
+        if "SeriesInstanceUID" not in header:
+            raise InputError(f"{item} is cut off: it ends before its series is named; copy the series again")
+        found.append(Slice(item, header, offset))
     if not found:
         raise InputError(f"the folder {folder} holds no DICOM files; give the folder that holds the CT's DICOM files")
     return found
@@ -227,10 +230,11 @@ def _check_whole(item: Slice) -> None:
     header = item.header
     syntax = header.file_meta.get("TransferSyntaxUID") if hasattr(header, "file_meta") else None
     size = item.path.stat().st_size
+    start = item.pixel_offset + (8 if syntax is not None and syntax.is_implicit_VR else 12)  # tag, representation, length
     if syntax is not None and syntax.is_compressed:
-        needed = item.pixel_offset + 8
+        needed = start
     else:
-        needed = item.pixel_offset + 8 + int(header.Rows) * int(header.Columns) * int(header.get("BitsAllocated", 16)) // 8
+        needed = start + int(header.Rows) * int(header.Columns) * int(header.get("BitsAllocated", 16)) // 8
     if size < needed:
         raise InputError(f"{item.path} is cut off: {size} bytes, expected at least {needed}; copy the series again")
 

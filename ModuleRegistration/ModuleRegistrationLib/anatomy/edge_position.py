@@ -30,7 +30,7 @@ def shifted_to_edge(mesh: BoneMesh, voxels: BoneVoxels, triangles: Triangles) ->
     used = np.zeros(len(mesh.points), dtype=bool)
     used[triangles.ravel()] = True
     found = np.flatnonzero(used)
-    shift = np.zeros(len(mesh.points), dtype=np.float32)
+    shift: Floats = np.zeros(len(mesh.points), dtype=np.float32)
     shift[found] = edge_shift(mesh.points[found], mesh.normals[found], voxels)
     shift = _smoothed(shift, triangles)
     return BoneMesh(mesh.points + shift[:, None] * mesh.normals, mesh.normals, mesh.triangles)
@@ -40,7 +40,7 @@ def edge_shift(points: Floats, normals: Floats, voxels: BoneVoxels) -> Floats:
     """(N,) distance (mm, outwards positive) from surface points (grid mm) to the half-way level along their normals."""
     from scipy.ndimage import map_coordinates
 
-    steps: Floats = np.arange(-INWARDS_MM, OUTWARDS_MM + STEP_MM / 2, STEP_MM, dtype=np.float32)
+    steps = np.arange(-INWARDS_MM, OUTWARDS_MM + STEP_MM / 2, STEP_MM, dtype=np.float32)
     scale = (1 / voxels.grid.spacing_mm[::-1]).astype(np.float32)
     start, along = (points - voxels.corner_mm) * scale, normals * scale
     profile = np.empty((len(steps), len(points)), dtype=np.float32)
