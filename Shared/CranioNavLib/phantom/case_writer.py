@@ -69,7 +69,7 @@ def write_case(
     def put(name: str, point_labels: tuple[str, ...], points: Array) -> None:
         write_points(case / f"{name}.mrk.json", LabelledPoints(point_labels, points), name)
 
-    fiducials, fle_mm = _fiducials(patient, mode)
+    fiducials, fle_mm = mode_fiducials(patient, mode)
     names = fiducial_labels(mode)
     put("landmarks-ct", names, fiducials)
     put("landmarks-patient", names, patient.digitise(fiducials, rng, fle_mm))
@@ -100,13 +100,13 @@ def fiducial_labels(mode: str) -> tuple[str, ...]:
     return LANDMARK_LABELS
 
 
-def _fiducials(patient: VirtualPatient, mode: str) -> tuple[Array, float]:
+def mode_fiducials(patient: VirtualPatient, mode: str) -> tuple[Array, float]:
     """True places (N, 3) of a mode's fiducials, RAS, and how well they are found (SD per axis, mm)."""
     if mode == "Ia":
         return patient.scanned.screws_ras_mm, constants.BONE_SCREW_FLE_SD_MM
     if mode == "Ib":
-        return patient.scanned.stickers_ras_mm, constants.SKIN_MARKER_FLE_SD_MM
-    return patient.landmarks_ras_mm, constants.LANDMARK_FLE_SD_MM
+        return patient.scanned.stickers_ras_mm, patient.condition.skin_marker_fle_sd_mm
+    return patient.landmarks_ras_mm, patient.condition.landmark_fle_sd_mm
 
 
 def _write_ct(patient: VirtualPatient, case: Path, ct_name: Optional[str]) -> None:
@@ -125,7 +125,7 @@ def write_volume(path: str | Path, volume: Volume) -> None:
 
 
 def _write_image(volume: Volume, path: Path) -> None:
-    import SimpleITK as sitk  # noqa: N813  its own convention
+    import SimpleITK as sitk
 
     image: Any = sitk.GetImageFromArray(volume.hu)
     spacing = np.linalg.norm(volume.ijk_to_ras[:3, :3], axis=0)

@@ -132,3 +132,10 @@ LIFT_MM = 45.0  # [M] above the head on the way
 PIVOT_CONE_DEG = 28.0  # [M] half angle of a careful pivot calibration
 PIVOT_PERIODS_S = (5.3, 3.7)  # [M]
 TIP_SLIP_SD_MM = 0.1  # [M] of a tip resting in a divot or on bone
+
+# --- Other studies than the phantom: what differs ------------------------------------------------------------------
+CADAVER_SPEED_OF_SOUND_RANGE_M_S = (1491.0, 1559.0)  # [S] formalin-fixed scalp 1525 +- 17 (UMB 2023), two SD
+CADAVER_ATTENUATION_RANGE_DB_CM_MHZ = (1.87, 3.31)  # [S] formalin-fixed scalp 2.59 +- 0.72 (UMB 2023)
+PATIENT_LANDMARK_FLE_SD_MM = 1.27  # [C] per axis: gives 3.4 mm TRE, as face landmarks in 98 clinical registrations [S]
+PATIENT_SKIN_MARKER_FLE_SD_MM = 2.5  # [M] per axis: the phantom's, and skin that shifts
+PATIENT_MISSING_FRAME_SHARE = 0.06  # [M] drapes and hands in the camera's way

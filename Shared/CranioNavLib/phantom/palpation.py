@@ -31,20 +31,22 @@ def palpate(
     normals: npt.ArrayLike,
     rng: np.random.Generator,
     lines_per_point: int = constants.DWELL_LINES,
-    missing_share: float = constants.MISSING_FRAME_SHARE,
+    missing_share: Optional[float] = None,
     skill: Optional[Skill] = None,
 ) -> Palpation:
     """A-mode palpation of planned points (N, 3) whose outward normals (N, 3) are planned, too.
 
-    Some frames have no pose, as the camera loses the probe: their status is MISSING and their matrix NaN.
+    Some frames have no pose, as the camera loses the probe: their status is MISSING and their matrix NaN. Their share is
+    that of the patient's condition unless given.
     """
+    share = patient.condition.missing_share if missing_share is None else missing_share
     count = len(np.asarray(positions_ras_mm))
     stand = stand_at(patient, positions_ras_mm, normals, rng, skill)
     poses_ras = hold(stand, lines_per_point, rng, skill).reshape(-1, 4, 4)
     true_poses: Array = patient.ras_to_reference @ poses_ras
     points = np.repeat(np.arange(count), lines_per_point)
     reported = patient.tracker_error.of_poses(true_poses @ patient.probe_calibration_error, rng, points)
-    missing = rng.random(len(reported)) < missing_share
+    missing = rng.random(len(reported)) < share
     reported[missing] = np.nan
     dwell_s = lines_per_point / constants.LINE_RATE_HZ
     within = np.tile(np.arange(lines_per_point) / constants.LINE_RATE_HZ, count)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from CranioNavLib.errors import InputError
 from CranioNavLib.phantom import constants
 from CranioNavLib.phantom.anatomy import HeadSurfaces, extract_head
+from CranioNavLib.phantom.conditions import Condition, condition_named
 from CranioNavLib.phantom.planning_ct import scan
 from CranioNavLib.phantom.sites import LANDMARK_LABELS, SAMPLE_HEAD_LANDMARKS_MM, marker_positions, snap_to_bone
 from CranioNavLib.phantom.tracking import TrackerError
@@ -54,6 +55,7 @@ class VirtualPatient:
     tracker_error: TrackerError
     acquisition: Acquisition
     probe_calibration_error: Array  # (4, 4) the reported Probe frame in the true one
+    condition: Condition
 
     @property
     def planning_ct(self) -> Volume:
@@ -111,19 +113,25 @@ class VirtualPatient:
 
 
 def make_patient(
-    volume: Optional[Volume], seed: int, landmarks_ras_mm: Optional[npt.ArrayLike] = None, ct_seed: int = 0
+    volume: Optional[Volume],
+    seed: int,
+    landmarks_ras_mm: Optional[npt.ArrayLike] = None,
+    ct_seed: int = 0,
+    condition: str = "phantom",
 ) -> VirtualPatient:
     """A virtual patient with the head in `volume`; None: the parametric synthetic head.
 
     Patients of one volume and `ct_seed` share head, markers and planning CT (a head is scanned once); `seed` draws the
     place in Reference, the tissue, and the tracker's axes. The landmarks are known for the sample head and the synthetic
-    head, and must be given (4, 3; in the order of LANDMARK_LABELS, RAS) for another.
+    head, and must be given (4, 3; in the order of LANDMARK_LABELS, RAS) for another. `condition` names the kind of
+    study: "phantom", "cadaver" or "patient".
 
     Raises
     ------
     InputError
-        `volume` holds no head, or its landmarks are neither known nor given.
+        `volume` holds no head, its landmarks are neither known nor given, or there is no such condition.
     """
+    drawn_for = condition_named(condition)
     if volume is None:
         scanned = _scan_synthetic(ct_seed)
     else:
@@ -140,13 +148,14 @@ def make_patient(
         scanned=scanned,
         seed=seed,
         true_reference_to_ras=base_to_ras,
-        tissue=Tissue.draw(rng),
+        tissue=Tissue.draw(rng, drawn_for),
         tracker_error=TrackerError(Rotation.random(random_state=rng).as_matrix()),
         acquisition=acquisition(),
         probe_calibration_error=rigid_from_vector(
             np.radians(rng.normal(0.0, constants.PROBE_CALIBRATION_SD_DEG, 3)),
             rng.normal(0.0, constants.PROBE_CALIBRATION_SD_MM, 3),
         ),
+        condition=drawn_for,
     )
 
 

@@ -140,7 +140,7 @@ class SimulatedSession:
 
     def touch_landmark(self, index: int) -> None:
         """Put the stylus tip on an anatomical landmark, as well as a user finds it."""
-        self.touch_point(self.patient.landmarks_ras_mm[index], constants.LANDMARK_FLE_SD_MM)
+        self.touch_point(self.patient.landmarks_ras_mm[index], self.patient.condition.landmark_fle_sd_mm)
 
     def touch_point(self, point_ras_mm: npt.ArrayLike, sd_mm: float = constants.PALPATION_FLE_SD_MM) -> None:
         """Put the stylus tip on a point of the head (RAS)."""

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from CranioNavLib.phantom import constants
 from CranioNavLib.phantom.beam import BEAM_WEIGHTS, BeamOnBone, look_at_bone
+from CranioNavLib.phantom.conditions import Condition
 from CranioNavLib.phantom.fields import SmoothField
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Acquisition
@@ -64,15 +65,15 @@ class Tissue:
     amplitude_fields: tuple[SmoothField, ...]
 
     @classmethod
-    def draw(cls, rng: np.random.Generator) -> Tissue:
+    def draw(cls, rng: np.random.Generator, condition: Condition) -> Tissue:
         """A patient."""
 
         def field() -> SmoothField:
             return SmoothField.draw(rng, constants.SITE_CORRELATION_MM)
 
         return cls(
-            speed_of_sound_m_s=float(rng.uniform(*constants.SPEED_OF_SOUND_RANGE_M_S)),
-            attenuation_db_cm_mhz=float(rng.uniform(*constants.ATTENUATION_RANGE_DB_CM_MHZ)),
+            speed_of_sound_m_s=float(rng.uniform(*condition.speed_of_sound_range_m_s)),
+            attenuation_db_cm_mhz=float(rng.uniform(*condition.attenuation_range_db_cm_mhz)),
             bone_impedance_mrayl=float(rng.uniform(*constants.BONE_IMPEDANCE_RANGE_MRAYL)),
             diffuse_floor_db=float(rng.uniform(*constants.DIFFUSE_FLOOR_DB)),
             full_scale=float(rng.uniform(*constants.FULL_SCALE_RANGE)),
