@@ -76,17 +76,18 @@ def rough_noise(magnitude: Floats) -> Array:
     """As noise_level, but from the envelope itself: a little too high, and cheap."""
     count, length = magnitude.shape
     block = max(length // NOISE_BLOCKS, 1)
-    means = magnitude[:, : block * (length // block)].reshape(count, -1, block).mean(axis=2)
+    means = magnitude[:, : block * (length // block)].reshape(count, length // block, block).mean(axis=2)
     return np.asarray(means.min(axis=1).astype(float) / np.sqrt(np.pi / 2)) + 1e-6
 
 
 def refine_peaks(magnitude: Floats, samples: npt.NDArray[np.int64]) -> tuple[Array, Array]:
     """Sub-sample positions (in samples) and heights of peaks, by a parabola through the logarithm; NaN for padding."""
-    positions, heights, _ = _fit_tops(magnitude, samples)
+    positions, heights, _ = fit_tops(magnitude, samples)
     return positions, heights
 
 
-def _fit_tops(magnitude: Floats, samples: npt.NDArray[np.int64]) -> tuple[Array, Array, Array]:
+def fit_tops(magnitude: Floats, samples: npt.NDArray[np.int64]) -> tuple[Array, Array, Array]:
+    """As refine_peaks, and the standard deviation (samples) of the Gaussian that has each peak's curvature."""
     safe = np.clip(samples, 1, magnitude.shape[1] - 2)
     left, mid, right = (np.log(np.take_along_axis(magnitude, safe + step, axis=1).astype(float) + 1e-9) for step in (-1, 0, 1))
     curvature = np.minimum(left - 2 * mid + right, -1e-6)
@@ -134,14 +135,14 @@ def find_candidates(
     """
     noise = noise_level(levels)
     rate = envelopes.rate_hz
-    skin = float(np.median(skin_s))
+    skin = float(np.median(skin_s)) if len(skin_s) else 0.0
     first = max(int((skin + window_s[0]) * rate), 0)
     last = min(int((skin + window_s[1]) * rate) + 1, magnitude.shape[1])
     if last - first < 6:
         return _none(len(magnitude), noise)
     rise = TYPICAL_ATTENUATION * transducer_hz * 1e-6 * 154e3  # dB a second of delay: 77 km/s of depth, both ways, per cm
     samples = salient_peaks(levels, rate, rise, first, last)
-    positions, heights, widths = _fit_tops(magnitude, samples)
+    positions, heights, widths = fit_tops(magnitude, samples)
     complex_values = np.take_along_axis(envelopes.values, np.clip(samples, 0, None), axis=1)
     # the baseband phase hardly changes within a sample; the carrier's phase is that of the refined time
     phases = np.angle(complex_values) + 2 * np.pi * envelopes.carrier_hz * (positions / rate)

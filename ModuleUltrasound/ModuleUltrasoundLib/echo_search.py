@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
+from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Recording
 
@@ -13,8 +15,9 @@ from ModuleUltrasoundLib.echo_candidates import Candidates, concatenate, find_ca
 from ModuleUltrasoundLib.echo_features import line_features
 from ModuleUltrasoundLib.echo_timing import BEFORE, BEHIND, Complexes
 from ModuleUltrasoundLib.signal_chain import Envelopes, check_acquisition, complex_envelopes, design_band
-from ModuleUltrasoundLib.signal_forerun import Forerun, find_forerun, nominal_skin_s, suppress_multiples
+from ModuleUltrasoundLib.signal_forerun import Forerun, find_forerun, nominal_skin_s, steady, suppress_multiples
 
+BANG_SAMPLES = 40  # ten cycles
 KEPT = 3  # candidates of a line whose echo is kept sample by sample
 CHUNK = 128  # lines worked on at once: the working set stays in the processor's cache
 BEHIND_S = 4e-6  # of a line kept behind the deepest bone: what follows an echo speaks for or against it
@@ -30,6 +33,7 @@ class Found:
     features: Array  # (n, K, D)
     depths_mm: Array  # (n, K) at the speed of sound given
     windows: Complexes  # (n, KEPT, W) complex envelope around the first candidates, for the time of flight
+    bang: npt.NDArray[np.complex128]  # mean complex envelope of the lines' first samples
     rate_hz: float
     carrier_hz: float
 
@@ -48,10 +52,12 @@ def search_lines(
     Raises
     ------
     InputError
-        The recording's header cannot be that of pulse-echo lines.
+        The recording's header cannot be that of pulse-echo lines, or it holds poses only.
     """
     acquisition = recording.acquisition
     check_acquisition(acquisition)
+    if len(recording) and not recording.lines.shape[1]:
+        raise InputError("the recording holds no RF samples, only poses; record the A-lines with them (DimSize = N 1 F)")
     per_s = 500.0 * speed_m_s  # mm of depth a second of delay
     window = (depth_mm[0] / per_s, depth_mm[1] / per_s)
     skin = nominal_skin_s(acquisition)
@@ -61,10 +67,13 @@ def search_lines(
     phases: list[Array] = []
     features: list[Array] = []
     windows: list[Complexes] = []
+    bang = np.zeros(BANG_SAMPLES, dtype=complex)
     parts = max(-(-len(recording) // CHUNK), 1)
     for lines in np.array_split(recording.lines, parts):
         envelopes = complex_envelopes(lines, band)
         magnitude = np.abs(envelopes.values)
+        start = envelopes.values[:, :BANG_SAMPLES].sum(axis=0)
+        bang[: len(start)] += start
         forerun = find_forerun(envelopes, magnitude, rough_noise(magnitude), acquisition)
         if several_spots and skin > 0:
             suppress_multiples(envelopes, magnitude, forerun, acquisition)
@@ -83,13 +92,17 @@ def search_lines(
     forerun = Forerun(
         **{name: np.concatenate([getattr(part, name) for part in foreruns]) for name in Forerun.__dataclass_fields__}
     )
+    calm = steady(forerun)
+    candidates = replace(candidates, delays_s=candidates.delays_s + (forerun.skin_s - calm.skin_s)[:, None])
+    turned = 2 * np.pi * band.carrier_hz * (calm.skin_s - forerun.skin_s)
     return Found(
         candidates,
-        forerun,
-        np.concatenate(phases),
+        calm,
+        np.concatenate(phases) + np.where(calm.found, turned, 0.0),
         np.concatenate(features),
         candidates.delays_s * per_s,
         np.concatenate(windows),
+        bang / max(len(recording), 1),
         band.rate_hz,
         band.carrier_hz,
     )

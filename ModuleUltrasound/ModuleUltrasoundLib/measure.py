@@ -14,6 +14,7 @@ from CranioNavLib.sequence_metafile import Recording
 
 from ModuleUltrasoundLib.depth import bone_positions, covariances
 from ModuleUltrasoundLib.echo_likelihood import SHARED_NAMES, Network, probabilities, shared_features
+from ModuleUltrasoundLib.echo_onset import pulse_delay
 from ModuleUltrasoundLib.echo_search import Found, search_lines
 from ModuleUltrasoundLib.echo_timing import time_echoes
 from ModuleUltrasoundLib.echo_weights import SHARED, SINGLE
@@ -102,7 +103,8 @@ def networks() -> tuple[Network, Network]:
 
 
 def time_of(found: Found, best: npt.NDArray[np.int64], chance: Array, transducer_hz: float) -> tuple[Array, Array]:
-    """Correction of each chosen echo's time and its deviation, in seconds.
+    """Correction of each chosen echo's time and its deviation, in seconds; where no forerun echo gives the zero, the pulse's own
+    delay is part of the correction.
 
     An echo that was not among the first of its line has no window kept: its deviation is the bound for a Gaussian pulse.
     """
@@ -110,12 +112,15 @@ def time_of(found: Found, best: npt.NDArray[np.int64], chance: Array, transducer
     kept = best < found.windows.shape[1]
     peaks = np.where(kept, (found.candidates.delays_s + found.forerun.skin_s[:, None])[rows, best], np.nan)
     windows = found.windows[rows, np.minimum(best, found.windows.shape[1] - 1)]
-    timing, _ = time_echoes(
+    timing, pulse = time_echoes(
         windows, peaks, found.forerun_phases, chance[rows, best], found.rate_hz, found.carrier_hz, transducer_hz
     )
     snr = 10 ** (found.candidates.snrs_db[rows, best] / 20)
     bound = found.candidates.widths_s[rows, best] / np.maximum(snr, 1.0)
-    return np.where(kept, np.nan_to_num(timing.shift_s), 0.0), np.where(kept, np.maximum(timing.sd_s, bound / 2), bound)
+    late = np.where(found.forerun.measured, 0.0, pulse_delay(found.bang, pulse, transducer_hz))
+    return np.where(kept, np.nan_to_num(timing.shift_s), 0.0) - late, np.hypot(
+        np.where(kept, np.maximum(timing.sd_s, bound / 2), bound), found.forerun.sd_s
+    )
 
 
 def assemble(
@@ -137,7 +142,7 @@ def assemble(
     ok = np.array([status == "OK" for status in recording.statuses], dtype=bool)
     poses = np.where(ok[:, None, None], recording.probe_to_reference, np.nan)
     positions, beams = bone_positions(poses, depth, recording.acquisition.forerun_length_mm)
-    found_zero = found.forerun.found
+    found_zero = found.forerun.measured
     covariance = covariances(
         beams, depth, sd_s, recording.acquisition, speed, settings.beam_width_mm, settings.tilt_sd_deg, found_zero
     )

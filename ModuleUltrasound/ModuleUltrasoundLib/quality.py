@@ -13,7 +13,7 @@ Bools = npt.NDArray[np.bool_]
 TOLERANCE_MM = 0.5  # what "right" means
 CLIPPED_SHARE = 0.15  # of an echo's samples at the converter's end: beyond, its shape is lost
 QUIET_DB = 14.0  # the strongest of a line's candidates is below this over the noise: nothing is seen in it
-STRONG_FORERUN_DB = 3.0  # over the recording's median: nothing takes sound out of the forerun
+STRONG_FORERUN_DB = 5.0  # over the recording's median: nothing takes sound out of the forerun
 TILTED_DB = 9.0  # a bone echo weaker than this under the recording's others: a tilt of several degrees
 LIKELY = 0.3
 UNSTABLE_MM = 1.0  # off the neighbours' median along the beam, while the probe rests
@@ -97,9 +97,9 @@ def reasons_of(
         ("saturated", clipped),
         ("unstable", shaky),
         ("", good),
-        ("no contact", ~np.isfinite(depth_mm) | (quiet & (forerun_db > STRONG_FORERUN_DB))),
+        ("no contact", forerun_db > STRONG_FORERUN_DB),
         ("tilt too large", (likely > LIKELY) & (strength_db < -TILTED_DB)),
-        ("no echo", quiet | (likely < LIKELY)),
+        ("no echo", ~np.isfinite(depth_mm) | quiet | (likely < LIKELY)),
         ("doubtful echo", ~good),
     ]
     chosen = np.select([case for _, case in cases], np.arange(len(cases)), default=len(cases) - 1)

@@ -121,7 +121,7 @@ def remove_drift(lines: npt.NDArray[np.int16]) -> Floats:
     third = rf[:, -2 * quarter : -quarter].mean(axis=1)
     fourth = rf[:, -quarter:].mean(axis=1)
     slope = (fourth - third) / np.float32(quarter)
-    base = fourth - slope * np.float32(rf.shape[1] - quarter / 2)
+    base = fourth - slope * np.float32(rf.shape[1] - quarter / 2 - 0.5)
     ramp = np.stack([np.ones(rf.shape[1], dtype=np.float32), np.arange(rf.shape[1], dtype=np.float32)])
     rf -= np.stack([base, slope], axis=1) @ ramp
     return rf

@@ -6,19 +6,26 @@ and the pulse's own delay, because both echoes share the pulse.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Acquisition
 
-from ModuleUltrasoundLib.echo_candidates import refine_peaks
+from ModuleUltrasoundLib.echo_candidates import fit_tops
 from ModuleUltrasoundLib.signal_chain import Envelopes
 
 SEARCH = 0.04  # of the nominal time: temperature changes the delay line's speed by 1 to 3 %, and its length is machined
 SEARCH_S = 4e-7  # on top: the pulse's own delay
 LEAST_SNR = 6.0  # envelope peak over the noise of one quadrature
+SAME_S = 1e-7  # lines of one recording show the face this near to each other
+LEAST_SHARE = 0.4  # of a batch's lines must show it
+CONTRAST = 6.0  # of the echo over the mean level behind it; speckle seldom reaches 4
+CONTRAST_EXPECTED = 3.0  # the same where the header says that the echo should be
+BEHIND_S = 3e-6
+NEIGHBOURS = 15  # lines on each side over which the delay line's temperature is taken as constant: under a second
+MEDIAN_TO_SD = 1.4826
 MULTIPLES = 4
 PULSE_CYCLES = 3.0  # half length of the pulse that is subtracted at a multiple
 LEAST_LINES = 6  # lines of a batch from which the strength of a multiple can be learnt
@@ -32,6 +39,8 @@ class Forerun:
     skin_s: Array  # (n,) time of the skin: the centre of the forerun's echo, or the nominal time
     amplitude: Array  # (n,) envelope of the forerun's echo; 0 where none was found
     found: npt.NDArray[np.bool_]  # (n,) the echo was seen in this line
+    measured: npt.NDArray[np.bool_]  # (n,) the time comes from this line's echo or its neighbours', not from the header
+    sd_s: Array  # (n,) of the skin's time, as far as noise makes it uncertain
 
 
 def nominal_skin_s(acquisition: Acquisition) -> float:
@@ -42,25 +51,70 @@ def nominal_skin_s(acquisition: Acquisition) -> float:
 
 
 def find_forerun(envelopes: Envelopes, magnitude: npt.NDArray[np.float32], noise: Array, acquisition: Acquisition) -> Forerun:
-    """The echo of the forerun's face in each line; where it is too weak, the median of the other lines' times."""
+    """The echo of the forerun's face in each line.
+
+    An echo is believed if it stands out of what follows (tissue begins there, and its speckle must not be taken for the face)
+    and lies where the other lines of the batch show it. Lines in which it is too weak get the others' median; if most lines
+    lack it, all get the nominal time.
+    """
     nominal = nominal_skin_s(acquisition)
     count, length = magnitude.shape
-    nothing = Forerun(np.full(count, nominal), np.zeros(count), np.zeros(count, dtype=bool))
+    false = np.zeros(count, dtype=bool)
+    nothing = Forerun(np.full(count, nominal), np.zeros(count), false, false, np.zeros(count))
     rate = envelopes.rate_hz
-    first = max(int((nominal * (1 - SEARCH) - SEARCH_S) * rate), 1)
+    first = max(int((nominal * (1 - SEARCH) - SEARCH_S / 2) * rate), 1)
     last = min(int((nominal * (1 + SEARCH) + SEARCH_S) * rate) + 1, length - 1)
     if nominal == 0.0 or last - first < 3:
         return nothing
     samples = magnitude[:, first:last].argmax(axis=1)[:, None] + first
-    positions, heights = (values[:, 0] for values in refine_peaks(magnitude, samples))
+    positions, heights, widths = (values[:, 0] for values in fit_tops(magnitude, samples))
+    guard = int(PULSE_CYCLES / acquisition.transducer_hz * rate)
+    index = np.minimum(samples + guard + np.arange(int(BEHIND_S * rate)), length - 1)
+    behind = np.exp(np.log(np.take_along_axis(magnitude, index, axis=1) + 1e-3).mean(axis=1))
+    times = positions / rate
+    expected = (times > nominal - 0.3 / acquisition.transducer_hz) & (times < nominal + 1.5 / acquisition.transducer_hz)
     inside = (samples[:, 0] > first) & (samples[:, 0] < last - 1)
-    found = inside & (heights > LEAST_SNR * noise)
+    found = inside & (heights > LEAST_SNR * noise) & (heights > np.where(expected, CONTRAST_EXPECTED, CONTRAST) * behind)
     if not found.any():
         return nothing
-    times = positions / rate
     middle = float(np.median(times[found]))
-    found &= np.abs(times - middle) < SEARCH_S
-    return Forerun(np.where(found, times, middle), np.where(found, heights, 0.0), found)
+    found &= np.abs(times - middle) < SAME_S
+    if found.sum() < LEAST_SHARE * count:
+        return nothing
+    middle = float(np.median(times[found]))
+    sd = np.where(found, widths / rate * noise / np.maximum(heights, 1e-9), SAME_S / 2)
+    return Forerun(np.where(found, times, middle), np.where(found, heights, 0.0), found, ~false, sd)
+
+
+def steady(forerun: Forerun) -> Forerun:
+    """The skin's times freed of the echo's noise, over a whole recording.
+
+    The delay line warms slowly, so neighbouring lines share its time; what jitters beyond the echo's noise (the trigger) is
+    the line's own and is kept. Each time is drawn to its neighbours' mean by the share that noise has in the scatter.
+    """
+    seen = np.flatnonzero(forerun.found)
+    if len(seen) < LEAST_LINES:
+        return forerun
+    times, variance = forerun.skin_s[seen], forerun.sd_s[seen] ** 2
+    weight = 1 / variance
+    mean = _running(weight * times, NEIGHBOURS) / _running(weight, NEIGHBOURS)
+    noise = float(np.median(variance))
+    scatter = (MEDIAN_TO_SD * float(np.median(np.abs(times - mean)))) ** 2
+    own = max(scatter - noise, 0.0) / max(scatter, noise)  # share of the scatter that is not noise
+    drawn = mean + own * (times - mean)
+    rest = own**2 * variance + (1 - own) ** 2 / _running(weight, NEIGHBOURS)
+    times_s, sd_s = forerun.skin_s.copy(), forerun.sd_s.copy()
+    times_s[seen], sd_s[seen] = drawn, np.sqrt(rest)
+    missing = np.flatnonzero(forerun.measured & ~forerun.found)
+    times_s[missing] = np.interp(missing, seen, drawn)
+    return replace(forerun, skin_s=times_s, sd_s=sd_s)
+
+
+def _running(values: Array, reach: int) -> Array:
+    """Sums over `reach` values on each side, fewer at the ends."""
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    index = np.arange(len(values))
+    return np.asarray(sums[np.minimum(index + reach + 1, len(values))] - sums[np.maximum(index - reach, 0)])
 
 
 def suppress_multiples(

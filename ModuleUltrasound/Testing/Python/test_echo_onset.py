@@ -1,0 +1,70 @@
+import numpy as np
+import pytest
+from CranioNavLib.sequence_metafile import Acquisition
+from ModuleUltrasoundLib.echo_onset import delay_from_bang, delay_from_shape, pulse_delay
+from ModuleUltrasoundLib.echo_timing import BEFORE, BEHIND, Pulse
+from ModuleUltrasoundLib.signal_chain import complex_envelopes, design_band
+
+RATE, CENTRE = 60e6, 5e6
+
+
+def damped(time, order, decay_cycles):
+    rise = np.clip(time * CENTRE / decay_cycles, 0, None)
+    return np.where(time >= 0, rise**order * np.exp(-rise), 0) * np.sin(2 * np.pi * CENTRE * time)
+
+
+def gaussian(time, bandwidth):
+    sigma = np.sqrt(2 * np.log(2)) / (np.pi * bandwidth * CENTRE)
+    return np.exp(-0.5 * (time / sigma) ** 2) * np.cos(2 * np.pi * CENTRE * time)
+
+
+def filtered(wave, bang=None):
+    """The pulse as the chain sees it, its true delay behind the arrival, and the start of a line with `bang` at zero."""
+    time = np.arange(2400) / RATE
+    arrival = 20e-6
+    line = wave(time - arrival)
+    if bang is not None:
+        line = line + bang(time)
+    codes = np.round(8000 * line / np.abs(line).max()).astype(np.int16)
+    envelopes = complex_envelopes(codes[None], design_band(Acquisition(RATE, CENTRE), 2400, 1.0))
+    values = envelopes.values[0].astype(complex)
+    first = int(10e-6 * envelopes.rate_hz)
+    peak = first + int(np.abs(values[first:]).argmax())
+    pulse = Pulse(values[peak - BEFORE : peak + BEHIND + 1] / abs(values[peak]), envelopes.rate_hz, 100, 0.0, np.inf)
+    return pulse, peak / envelopes.rate_hz - arrival, values[:40]
+
+
+@pytest.mark.parametrize("order", [0, 1, 2])
+@pytest.mark.parametrize("decay", [0.5, 0.9])
+def test_damped_pulse_has_its_origin_at_its_onset(order, decay):
+    pulse, late, _ = filtered(lambda t: damped(t, order, decay))
+    # an eighth of a cycle comes from the whole-sample peak of this test; half a cycle is 0.08 mm at 5 MHz
+    assert delay_from_shape(pulse, CENTRE) == pytest.approx(late, abs=0.5 / CENTRE)
+
+
+@pytest.mark.parametrize("bandwidth", [0.3, 0.5, 0.7, 0.9])
+def test_symmetric_pulse_has_its_origin_in_its_middle(bandwidth):
+    pulse, _, _ = filtered(lambda t: gaussian(t, bandwidth))
+    assert delay_from_shape(pulse, CENTRE) < 0.05 / CENTRE
+
+
+def test_main_bang_that_shows_the_whole_pulse_gives_its_delay():
+    late_by = 1.5 / CENTRE
+    wave = lambda t: gaussian(t - late_by, 0.7)  # noqa: E731
+    pulse, late, bang = filtered(wave, bang=wave)
+    assert late == pytest.approx(late_by, abs=0.13 / CENTRE)
+    assert delay_from_bang(bang, pulse, CENTRE) == pytest.approx(late_by, abs=0.1 / CENTRE)
+    assert pulse_delay(bang, pulse, CENTRE) == pytest.approx(late_by, abs=0.1 / CENTRE)
+
+
+def test_half_a_bang_or_a_long_ringing_tells_nothing():
+    wave = lambda t: gaussian(t, 0.7)  # noqa: E731
+    pulse, _, half = filtered(wave, bang=wave)
+    assert np.isnan(delay_from_bang(half, pulse, CENTRE))
+    _, _, ringing = filtered(wave, bang=lambda t: 3 * np.exp(-t / 4e-7) * np.cos(2 * np.pi * CENTRE * t))
+    assert np.isnan(delay_from_bang(ringing, pulse, CENTRE))
+
+
+def test_pulse_that_was_not_learnt_has_no_delay():
+    pulse, _, _ = filtered(lambda t: damped(t, 1, 0.9))
+    assert delay_from_shape(Pulse(pulse.values, pulse.rate_hz, 0, 0.0, np.inf), CENTRE) == 0
