@@ -2,15 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import sys
 from pathlib import Path
-
-from CranioNavLib.errors import InputError
-from ModuleTrackingLib.ndi.emulator.device import EmulatedPolaris, Model
-from ModuleTrackingLib.ndi.emulator.motion import HandMotion, Motion, ReplayedMotion
-from ModuleTrackingLib.ndi.emulator.server import Line, SocketLine, TerminalLine, serve, side_channel
-from ModuleTrackingLib.ndi.emulator.station import Station, make_faults
 
 
 def run(
@@ -33,7 +25,7 @@ def run(
     replay : Path, optional
         Pose CSV, played in a loop; without it four tools move as if by hand at `rate_hz`.
     faults : list of str
-        `NAME[:NUMBER[:NUMBER]]`, see `ModuleTrackingLib.ndi.emulator.faults.FAULTS`. While it runs, lines on
+        `NAME`, `NAME=NUMBER` or `NAME=NUMBER:NUMBER`, see `ModuleTrackingLib.ndi.emulator.faults.FAULTS`. While it runs, lines on
         standard input change them: `fault NAME`, `clear`, `reset`, `unplug SECONDS`; SIGUSR1 resets too.
     tcp, port : bool, int
         Serve 127.0.0.1 instead of a pseudo-terminal; port 0 takes a free one.
@@ -51,27 +43,16 @@ def run(
     InputError
         A pose file or a fault that cannot be used, or no pseudo-terminals on this system.
     """
-    motion: Motion = ReplayedMotion(replay) if replay is not None else HandMotion(rate_hz)
+    from ModuleTrackingLib.ndi.emulator.device import EmulatedPolaris, Model
+    from ModuleTrackingLib.ndi.emulator.motion import HandMotion, ReplayedMotion
+    from ModuleTrackingLib.ndi.emulator.server import open_line, serve
+    from ModuleTrackingLib.ndi.emulator.station import Station, make_faults
+
+    motion = ReplayedMotion(replay) if replay is not None else HandMotion(rate_hz)
     device = EmulatedPolaris(motion, make_faults(faults or [], seed), Model(has_bx=not text_only))
-    line = _line(tcp, port, link)
+    line = open_line(tcp, port, link)
     try:
         print(line.url, flush=True)
-        with contextlib.suppress(KeyboardInterrupt):
-            serve(Station(device, paced), line, keep_state, side_channel(), _answer)
+        serve(Station(device, paced), line, keep_state)
     finally:
         line.close()
-
-
-def _line(tcp: bool, port: int, link: Path | None) -> Line:
-    if tcp:
-        try:
-            return SocketLine(port)
-        except OSError as error:
-            raise InputError(f"cannot serve TCP port {port}: {error.strerror}; choose another, or 0 for a free one") from None
-    if sys.platform == "win32":
-        raise InputError("Windows has no pseudo-terminals; serve a TCP port instead (--tcp)")
-    return TerminalLine(link)
-
-
-def _answer(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)

@@ -64,7 +64,7 @@ class Rig:
         usable = [pose for pose in poses if pose.tool_to_tracker is not None]
         numbers = set()
         for pose in usable:
-            x, y, z = pose.tool_to_tracker[:3, 3]
+            x, _, z = pose.tool_to_tracker[:3, 3]
             number = round(x) + 1000 * round(-1000.0 - z)
             index = self.motion.tools.index(pose.tool)
             truth = CountingMotion.pose(number, index)

@@ -245,15 +245,11 @@ def test_tracking_can_be_stopped_and_started_again():
 
 
 def test_a_device_that_needs_seconds_for_a_command_is_waited_for():
-    class Slow(Model):
-        pass
-
     rig = Rig()
     receive = rig.device.receive
 
     def slow(data, now_s):
         if data.startswith(b"PINIT"):
-            rig.clock.sleep(0.0)
             rig.station._line_free_s = now_s + 2.5  # the answer leaves the device so much later
         return receive(data, now_s)
 

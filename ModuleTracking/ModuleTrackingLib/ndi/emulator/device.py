@@ -58,23 +58,23 @@ class EmulatedPolaris:
         self.motion, self.faults, self.model = motion, faults or Faults(), model or Model()
         self.speed = POWER_ON_SPEED
         self._boots_until_s: Optional[float] = None
+        self._buffer = b""
         self._lose_all()
 
     def _lose_all(self) -> None:
         self.initialised = self.tracking = False
         self._handles: dict[int, _Handle] = {}
-        self._buffer = b""
         self._next_frame, self._tracking_since_s = self.model.first_frame, 0.0
 
     def power_cycle(self, now_s: float) -> None:
         """Break, RESET or power failure: everything is lost, and after the boot time RESET is sent at 9600."""
         self._lose_all()
-        self.speed, self._boots_until_s = POWER_ON_SPEED, now_s + self.model.boot_s
+        self.speed, self._boots_until_s, self._buffer = POWER_ON_SPEED, now_s + self.model.boot_s, b""
 
     def start_afresh(self) -> None:
         """As after a power cycle whose RESET message nobody heard."""
         self._lose_all()
-        self.speed, self._boots_until_s = POWER_ON_SPEED, None
+        self.speed, self._boots_until_s, self._buffer = POWER_ON_SPEED, None, b""
 
     def booted(self, now_s: float) -> list[bytes]:
         """The RESET message, once, when the boot time is over."""

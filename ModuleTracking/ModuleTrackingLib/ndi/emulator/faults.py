@@ -13,7 +13,7 @@ Generator = np.random.Generator
 
 @dataclass(frozen=True)
 class FaultKind:
-    """A fault's meaning and the meaning and default of its numbers (`NAME:FIRST:SECOND`)."""
+    """A fault's meaning and the meaning and default of its numbers (`NAME=FIRST:SECOND`)."""
 
     help: str
     numbers: tuple[tuple[str, float], ...]
@@ -55,14 +55,14 @@ class Faults:
         self.rng = np.random.default_rng(self.seed)
 
     def switch_on(self, spec: str) -> None:
-        """Add `NAME`, `NAME:NUMBER` or `NAME:NUMBER:NUMBER`.
+        """Add `NAME`, `NAME=NUMBER` or `NAME=NUMBER:NUMBER` (`:` does for `=`).
 
         Raises
         ------
         InputError
             An unknown fault, or numbers that do not fit it.
         """
-        name, *given = spec.strip().split(":")
+        name, *given = spec.strip().replace("=", ":").split(":")
         if name not in FAULTS:
             raise InputError(f"unknown fault {name!r}; known: {', '.join(FAULTS)}")
         described = FAULTS[name].numbers

@@ -11,10 +11,12 @@ import socket
 import sys
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from pathlib import Path
 from typing import Optional
 
+from CranioNavLib.errors import InputError
+
+from ModuleTrackingLib.ndi.emulator.device import POWER_ON_SPEED
 from ModuleTrackingLib.ndi.emulator.station import Station
 
 IDLE_S = 0.2  # the longest sleep: signals and timed faults are seen this soon
@@ -182,21 +184,44 @@ class SocketLine(Line):
         self._listener.close()
 
 
-def serve(
-    station: Station, line: Line, keep_state: bool = False, control: Optional[int] = None, say: Callable[[str], None] = print
-) -> None:
+def open_line(tcp: bool = False, port: int = 0, link: Path | None = None) -> Line:
+    """A TCP port on this computer, or a pseudo-terminal.
+
+    Raises
+    ------
+    InputError
+        The port is taken, or this system has no pseudo-terminals.
+    """
+    if tcp:
+        try:
+            return SocketLine(port)
+        except (OSError, OverflowError) as error:
+            raise InputError(f"cannot serve TCP port {port}: {error}; choose another, or 0 for a free one") from None
+    if sys.platform == "win32":
+        raise InputError("Windows has no pseudo-terminals; serve a TCP port instead")
+    try:
+        return TerminalLine(link)
+    except OSError as error:
+        raise InputError(f"no pseudo-terminal: {error}; choose another link, or serve a TCP port instead") from None
+
+
+def serve(station: Station, line: Line, keep_state: bool = False) -> None:
     """Serve the line until the process is interrupted or terminated.
+
+    Lines on standard input are the side channel (see `CONTROL_HELP`), answered on standard error;
+    SIGUSR1 resets the device.
 
     Parameters
     ----------
     keep_state : bool
-        Let the device go on when the host closes the line. Otherwise closing resets it, which stands
-        for the break that neither a pseudo-terminal nor a socket carries.
-    control : int, optional
-        File descriptor whose lines are the side channel (see `CONTROL_HELP`). SIGUSR1 resets too.
-    say : callable
-        Where answers of the side channel go.
+        Let the device go on when the host closes the line or goes back to 9600 baud. Otherwise both reset
+        it, which stands for the break that neither a pseudo-terminal nor a socket carries.
     """
+    with contextlib.suppress(KeyboardInterrupt):
+        _serve(station, line, keep_state, side_channel())
+
+
+def _serve(station: Station, line: Line, keep_state: bool, control: Optional[int]) -> None:
     reset_asked: list[bool] = []
     stop_asked: list[bool] = []
     signal.signal(signal.SIGTERM, lambda *_: stop_asked.append(True))
@@ -222,13 +247,18 @@ def serve(
             control = control if piece else None
             *lines, typed = (typed + piece).split(b"\n")
             for text in lines:
-                say(station.control(text.decode("utf-8", "replace"), now))
+                print(station.control(text.decode("utf-8", "replace"), now), file=sys.stderr, flush=True)
         data = line.read(ready)
         if data:
-            station.receive(data, line.host_speed(), now)
-        due = station.take_due(time.monotonic(), line.host_speed())
-        if due:
-            line.write(due)
+            speed = line.host_speed()
+            if not keep_state and speed == POWER_ON_SPEED != station.device.speed:
+                station.hang_up()  # a host that goes back to 9600 by itself means a break, or opened the line anew
+            station.receive(data, speed, now)
+        wakes = station.wakes_at_s()
+        if wakes is not None and wakes <= time.monotonic():
+            line.write(station.take_due(time.monotonic(), line.host_speed()))
+        else:
+            station.tick(now)
 
 
 def side_channel() -> Optional[int]:

@@ -11,7 +11,7 @@ from ModuleTrackingLib.ndi.emulator.device import EmulatedPolaris
 from ModuleTrackingLib.ndi.emulator.faults import Faults, garble
 
 BITS_A_BYTE = 10  # start bit, eight data bits, stop bit
-CONTROL_HELP = "fault NAME[:NUMBER[:NUMBER]] | clear [NAME] | reset | unplug SECONDS"
+CONTROL_HELP = "fault NAME[=NUMBER[:NUMBER]] | clear [NAME] | reset | unplug SECONDS"
 
 
 class Station:
@@ -110,7 +110,7 @@ class Station:
 
 
 def make_faults(specs: list[str], seed: int = 0) -> Faults:
-    """Faults switched on from `NAME[:NUMBER[:NUMBER]]` texts."""
+    """Faults switched on from `NAME[=NUMBER[:NUMBER]]` texts."""
     faults = Faults(seed)
     for spec in specs:
         faults.switch_on(spec)
