@@ -20,7 +20,7 @@ def echo(
     from collections import Counter
 
     from CranioNavLib.sequence_metafile import read_recording
-    from ModuleUltrasoundLib.measure import MeasureSettings, measure_lines, write_depths_csv
+    from ModuleUltrasoundLib.measure import EchoSettings, measure_lines, write_depths_csv
 
     from Workstation.terminal import print_json, progress_bar
 
@@ -28,7 +28,7 @@ def echo(
         say("reading the recording", 0.0)
         lines = read_recording(recording)
         say("looking for bone", 0.3)
-        settings = MeasureSettings() if speed_of_sound is None else MeasureSettings(speed_of_sound_m_s=speed_of_sound)
+        settings = EchoSettings() if speed_of_sound is None else EchoSettings(speed_of_sound_m_s=speed_of_sound)
         measured = measure_lines(lines, settings)
         say("writing", 0.95)
         write_depths_csv(output, lines, measured)

@@ -62,8 +62,8 @@ def write_report(
     write_text(path, page)
 
 
-def _figures(result: CaseResult, say: Callable[[str, float], None]) -> dict[str, str]:
-    drawn: dict[str, str] = {}
+def _figures(result: CaseResult, say: Callable[[str, float], None]) -> dict[str, Optional[str]]:
+    drawn: dict[str, Optional[str]] = {}
     drawings = {
         "skull": report_figures.skull_with_points,
         "error_map": report_figures.error_map,
@@ -74,8 +74,7 @@ def _figures(result: CaseResult, say: Callable[[str, float], None]) -> dict[str,
         for number, (name, draw) in enumerate(drawings.items()):
             say("drawing the report", number / len(drawings))
             picture = draw(result)
-            if picture is not None:
-                drawn[name] = "data:image/png;base64," + base64.b64encode(picture).decode("ascii")
+            drawn[name] = None if picture is None else "data:image/png;base64," + base64.b64encode(picture).decode("ascii")
     return drawn
 
 
