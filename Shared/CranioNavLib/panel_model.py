@@ -70,6 +70,7 @@ class PanelModel:
         self.busy: Action | None = None
         self.progress = Progress()
         self._listeners: list[Callable[[], None]] = []
+        self._stamp: tuple[tuple[str, int], ...] = ()
         self._refusals: tuple[type[Exception], ...] = (InputError, *getattr(logic, "refusals", ()))
 
     # Fields
@@ -170,6 +171,14 @@ class PanelModel:
         """Let all listeners draw anew."""
         for listener in list(self._listeners):
             listener()
+
+    def scene_changed(self) -> bool:
+        """Whether parameters or shown nodes have changed since the last call, by whomever: then draw anew."""
+        nodes = [self._parameters().node]
+        nodes += [scene.find(item.role) for item in self.panel.items() if isinstance(item, NodeField)]
+        stamp = tuple((node.GetID(), node.GetMTime()) for node in nodes if node is not None)
+        changed, self._stamp = stamp != self._stamp, stamp
+        return changed
 
     def _parameters(self) -> ParameterNode[Parameters]:
         door: ParameterNode[Parameters] = self.logic.parameters()

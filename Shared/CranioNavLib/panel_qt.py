@@ -61,7 +61,7 @@ class PanelWidget:
             model.runner = self._runner = ThreadRunner(layout.parentWidget())
         self._timer = self.qt.QTimer(layout.parentWidget())
         self._timer.setInterval(REFRESH_MS)
-        connect(self._timer, "timeout()", self.refresh_live)
+        connect(self._timer, "timeout()", self.tick)
         model.listen(self.refresh)
         self.refresh()
 
@@ -94,6 +94,13 @@ class PanelWidget:
             label.setText(LEVEL_SIGNS[Level.BAD] + self.model.errors[name] if name in self.model.errors else "")
             label.setVisible(name in self.model.errors)
         self.refresh_live()
+
+    def tick(self) -> None:
+        """What the timer does: everything if the scene has changed, else what lives."""
+        if self.model.scene_changed():
+            self.refresh()
+        else:
+            self.refresh_live()
 
     def refresh_live(self) -> None:
         """Show what changes by itself: read-outs, message, progress, which buttons can be used."""

@@ -21,6 +21,7 @@ from CranioNavLib.parameters import ParameterInfo
 
 LOG = logging.getLogger(__name__)
 NO_LIMIT = 1e6
+LARGEST_INT = 2**31 - 1  # of Qt's spin box
 POLL_MS = 50
 
 
@@ -108,31 +109,41 @@ class ThreadRunner:
 
 
 class Section:
-    """A collapsible part of the panel: ctkCollapsibleButton inside the application, a tickable group box outside."""
+    """A collapsible part of the panel: ctkCollapsibleButton inside the application, a button over a body outside."""
 
     def __init__(self, title: str) -> None:
         qt = toolkit()
         if host.in_application():
-            self.widget = importlib.import_module("ctk").ctkCollapsibleButton()
+            self.widget = self._head = importlib.import_module("ctk").ctkCollapsibleButton()
             self.layout = qt.QVBoxLayout(self.widget)
-            return
-        self.widget = qt.QGroupBox()
-        self.widget.setCheckable(True)
-        outer, self._body = qt.QVBoxLayout(self.widget), qt.QWidget()
-        outer.addWidget(self._body)
-        self.layout = qt.QVBoxLayout(self._body)
-        connect(self.widget, "toggled(bool)", self._body.setVisible)
+        else:
+            self.widget, self._head, self._body = qt.QWidget(), qt.QPushButton(), qt.QWidget()
+            self._head.setCheckable(True)
+            self._head.setChecked(True)
+            self._head.setStyleSheet("text-align: left; padding: 4px; font-weight: 600;")
+            outer = qt.QVBoxLayout(self.widget)
+            outer.setContentsMargins(0, 0, 0, 0)
+            outer.addWidget(self._head)
+            outer.addWidget(self._body)
+            self.layout = qt.QVBoxLayout(self._body)
+            connect(self._head, "toggled(bool)", self._body.setVisible)
+        self.set_title(title)
+
+    @property
+    def title(self) -> str:
+        """What stands above the section."""
+        return str(self._head.property("text"))
 
     def set_title(self, title: str) -> None:
         """Show another title."""
-        self.widget.setProperty("text" if host.in_application() else "title", title)
+        self._head.setProperty("text", title)
 
     def set_collapsed(self, collapsed: bool) -> None:
         """Fold or unfold."""
         if host.in_application():
             self.widget.setProperty("collapsed", collapsed)
         else:
-            self.widget.setProperty("checked", not collapsed)
+            self._head.setProperty("checked", not collapsed)
 
 
 class NodeChooser:
@@ -225,7 +236,7 @@ class Editor:
         elif isinstance(value, Enum):
             self.input.setCurrentIndex(list(type(value)).index(value))
         elif isinstance(value, str):
-            if self.input.property("text") != value:
+            if self.input.property("text") != value and not self.input.hasFocus():  # not while the user types
                 self.input.setText(value)
         else:
             self.input.setValue(value)
@@ -262,7 +273,9 @@ def _input_for(info: ParameterInfo) -> Any:
     low, high = (info.limits.low, info.limits.high) if info.limits else (-NO_LIMIT, NO_LIMIT)
     if kind == "float":
         spin.setDecimals(3)  # a thousandth of a millimetre, a degree or a second is below what anybody sets
-    spin.setRange(*((int(low), int(high)) if kind == "int" else (low, high)))
+        spin.setRange(low, high)
+    else:
+        spin.setRange(max(int(low), -LARGEST_INT), min(int(high), LARGEST_INT))
     spin.setKeyboardTracking(False)
     spin.setSuffix(f" {info.unit}" if info.unit else "")
     return spin
