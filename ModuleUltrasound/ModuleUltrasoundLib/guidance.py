@@ -35,6 +35,8 @@ class GuidanceSettings(Parameters):
     )
 
 
+DEFAULTS = GuidanceSettings()
+
 # -- which point next
 
 
@@ -141,7 +143,7 @@ def reachable(
         From the head towards the table; (0, -1, 0) for a patient lying on the back.
     settings : GuidanceSettings, optional
     """
-    settings = settings or GuidanceSettings()
+    settings = settings or DEFAULTS
     free = np.ones(len(points), dtype=bool)
     if clamp_ras_mm is not None:
         clamp = check_points(clamp_ras_mm, "points on the clamp")
@@ -227,7 +229,7 @@ def guide(
         Of the registration's rotation (rad^2), to say how well the normal is known.
     settings : GuidanceSettings, optional
     """
-    settings = settings or GuidanceSettings()
+    settings = settings or DEFAULTS
     pose = np.asarray(probe_to_ras, dtype=float)
     origin, beam = pose[:3, 3], pose[:3, 2]
     target, normal = np.asarray(target_ras_mm, dtype=float), np.asarray(target_normal, dtype=float)
