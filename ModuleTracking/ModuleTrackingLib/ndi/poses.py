@@ -18,7 +18,7 @@ FARTHEST_MM = 20_000.0  # no measuring volume reaches that far
 
 
 def tool_poses(
-    reply: TrackingReply, tools: tuple[Tool, ...], count: int, counter_hz: float, host_time_s: float, alert: str = ""
+    reply: TrackingReply, tools: tuple[Tool, ...], count: int, device_time_s: float, host_time_s: float, alert: str = ""
 ) -> list[ToolPose]:
     """One ToolPose for every tool of the set-up; handles that nobody set up are left out.
 
@@ -26,8 +26,8 @@ def tool_poses(
     ----------
     count : int
         Frame number of the newest handle, unwrapped.
-    counter_hz : float
-        Ticks of the frame counter a second.
+    device_time_s : float
+        The device's own clock at that frame.
     host_time_s : float
         Monotonic time at which the reply was whole.
     alert : str
@@ -44,7 +44,7 @@ def tool_poses(
             status, matrix = PoseStatus.INVALID, None
         poses.append(
             ToolPose(
-                tool.name, matrix, status, host_time_s, count / counter_hz, count, error_mm, tuple(dict.fromkeys(flags + common))
+                tool.name, matrix, status, host_time_s, device_time_s, count, error_mm, tuple(dict.fromkeys(flags + common))
             )
         )
     return poses

@@ -66,8 +66,8 @@ class PolarisTracker(Tracker):
     """A Polaris. After a loss it connects and sets up again by itself, inside `read`.
 
     `state` and `message` say what it does; a callable in `on_state` is told of each change. While the
-    tracker is lost `read` returns every tool as missing, flagged "tracker lost". `device_time_s` starts
-    anew when the device does.
+    tracker is lost `read` returns every tool as missing, flagged "tracker lost". `device_time_s` goes on
+    across a loss, by the host's clock; `frame_number` is the device's and may start anew.
     """
 
     name = "polaris"
@@ -99,6 +99,8 @@ class PolarisTracker(Tracker):
         self._poller: Optional[Poller] = None
         self._url = ""
         self._identity = (0, 0, "")
+        self._counts_anew, self._time_offset_s = True, 0.0
+        self._last_times: Optional[tuple[float, float]] = None  # device and host time of the newest frame
         self._alert, self._alert_asked_s = "", float("-inf")
 
     # -- the tracker's life --------------------------------------------------------------------
@@ -106,6 +108,7 @@ class PolarisTracker(Tracker):
     def open(self) -> None:
         """See Tracker.open."""
         self.close()
+        self._last_times = None
         self._go(PolarisState.CONNECTING, "")
         self._url = self._find_port() if self.settings.port == "auto" else self.settings.port
         self._identity = next((choice.identity for choice in list_ports() if choice.device == self._url), (0, 0, ""))
@@ -208,7 +211,7 @@ class PolarisTracker(Tracker):
 
     def _track(self) -> Poller:
         _, session = self._opened
-        self._poller = Poller(session, self.settings.replies is not Replies.TEXT, self.clock.now)
+        self._poller, self._counts_anew = Poller(session, self.settings.replies is not Replies.TEXT, self.clock.now), True
         self._go(PolarisState.TRACKING, f"{len(session.tools)} tools at {session.line}")
         return self._poller
 
@@ -229,7 +232,17 @@ class PolarisTracker(Tracker):
         if reply.system_status & DIAGNOSTIC_PENDING and self.clock.now() - self._alert_asked_s > ALERT_EVERY_S:
             self._alert = self._ask_for_alert()
         alert = self._alert if reply.system_status & DIAGNOSTIC_PENDING else ""
-        return tool_poses(reply, session.tools, max(0, poller.clock.count), session.counter_hz, at_s, alert)
+        count = max(0, poller.clock.count)
+        return tool_poses(reply, session.tools, count, self._device_time(count / session.counter_hz, at_s), at_s, alert)
+
+    def _device_time(self, counted_s: float, host_time_s: float) -> float:
+        """The frame counter's time, moved on by the host's clock where the counter began anew after a loss."""
+        if self._counts_anew:
+            last_device_s, last_host_s = self._last_times or (counted_s, host_time_s)
+            self._time_offset_s = last_device_s + host_time_s - last_host_s - counted_s
+            self._counts_anew = False
+        self._last_times = (counted_s + self._time_offset_s, host_time_s)
+        return counted_s + self._time_offset_s
 
     def _lose(self, why: str) -> list[ToolPose]:
         """Note the loss, begin to mend it, and show every tool as missing."""

@@ -13,6 +13,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminal
 
 TOOLS = ("Reference", "Probe", "Stylus")
 FRAMES, RATE_HZ = 90, 30.0
+TEXT_STEPS = np.array([1e-4] * 4 + [1e-2] * 3 + [1e-4])  # of quaternion, mm and error in a text reply
 
 
 @pytest.fixture

@@ -232,6 +232,20 @@ def test_cable_pulled_while_tracking_is_shown_at_once_and_tracked_soon_after_its
             assert rig.tracker.losses == 1
 
 
+def test_device_time_goes_on_across_a_power_failure():
+    rig = Rig()
+    times = []
+    with rig.tracker:
+        for moment in range(400):
+            if moment == 150:
+                rig.device.power_cycle(rig.clock.now())
+            times += [(pose.host_time_s, pose.device_time_s) for pose in rig.tracker.read()[:1] if pose.usable]
+    assert rig.tracker.losses == 1
+    differences = [host - device for host, device in times]
+    assert max(differences) - min(differences) < 0.02
+    assert max(b[0] - a[0] for a, b in zip(times, times[1:])) > 0.5
+
+
 def test_brown_outs_end_in_tracking_again():
     rig = Rig(faults=["brown-out:4"])
     with rig.tracker:
