@@ -66,7 +66,7 @@ def take_levels(magnitude: Floats) -> Levels:
 
 def noise_level(levels: Levels) -> Array:
     """Standard deviation of one quadrature of each line's noise, from its quietest stretch, shape (n,)."""
-    count, length = levels.log.shape
+    length = levels.log.shape[1]
     edges = np.linspace(0, length, NOISE_BLOCKS + 1).astype(np.int64)
     means = (levels.sums[:, edges[1:]] - levels.sums[:, edges[:-1]]) / np.maximum(np.diff(edges), 1)
     return np.asarray(np.exp(means.min(axis=1).astype(float) - LOG_RAYLEIGH))
@@ -152,19 +152,23 @@ def find_candidates(
     base = np.log(noise)[:, None] + LOG_RAYLEIGH
     around = levels.mean(samples - reach, samples + reach + 1)
     start_near = np.maximum(samples - guard - near, skin_sample)
-    db = [
-        DECIBEL * (np.log(heights) - around),
-        DECIBEL * (levels.mean(start_near, samples - guard) - base),
-        DECIBEL * (levels.mean(samples + guard, samples + guard + near) - base),
-        DECIBEL * (levels.mean(skin_sample, samples - guard) - base),
-        DECIBEL * (levels.mean(samples + guard, end) - base),
-    ]
-    return Candidates(positions / rate - skin_s[:, None], heights, phases, widths / rate, *db, noise)
+    return Candidates(
+        delays_s=positions / rate - skin_s[:, None],
+        amplitudes=heights,
+        phases=phases,
+        widths_s=widths / rate,
+        saliences_db=DECIBEL * (np.log(heights) - around),
+        before_db=DECIBEL * (levels.mean(start_near, samples - guard) - base),
+        after_db=DECIBEL * (levels.mean(samples + guard, samples + guard + near) - base),
+        before_all_db=DECIBEL * (levels.mean(skin_sample, samples - guard) - base),
+        after_all_db=DECIBEL * (levels.mean(samples + guard, end) - base),
+        noise=noise,
+    )
 
 
 def _none(count: int, noise: Array) -> Candidates:
     empty = np.full((count, CANDIDATES), np.nan)
-    return Candidates(*[empty] * 9, noise)
+    return Candidates(empty, empty, empty, empty, empty, empty, empty, empty, empty, noise)
 
 
 def concatenate(parts: list[Candidates]) -> Candidates:

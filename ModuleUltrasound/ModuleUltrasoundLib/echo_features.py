@@ -8,6 +8,7 @@ echoes repeat at whole multiples of its time. The electronic noise is the same e
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 from CranioNavLib.rigid import Array
 
 from ModuleUltrasoundLib.echo_candidates import DECIBEL, Candidates
@@ -85,7 +86,7 @@ def _multiples(candidates: Candidates, forerun: Forerun, nominal_skin_s: float, 
     return place, share
 
 
-def _reverberations(candidates: Candidates, pair: Array, before: Array) -> Array:
+def _reverberations(candidates: Candidates, pair: Array, before: npt.NDArray[np.bool_]) -> Array:
     """How much stronger (dB) an earlier echo is of which this one would be the first reverberation under the skin."""
     delays = np.nan_to_num(candidates.delays_s)
     off = np.abs(delays[:, :, None] - 2 * delays[:, None, :])

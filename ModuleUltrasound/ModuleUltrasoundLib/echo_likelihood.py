@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from CranioNavLib.rigid import Array
-
 from scipy.ndimage import gaussian_filter1d
 
 from ModuleUltrasoundLib.echo_candidates import DECIBEL, Candidates

@@ -67,7 +67,7 @@ def search_lines(
     phases: list[Array] = []
     features: list[Array] = []
     windows: list[Complexes] = []
-    bang = np.zeros(BANG_SAMPLES, dtype=complex)
+    bang = np.zeros(BANG_SAMPLES, dtype=np.complex128)
     parts = max(-(-len(recording) // CHUNK), 1)
     for lines in np.array_split(recording.lines, parts):
         envelopes = complex_envelopes(lines, band)
@@ -102,7 +102,7 @@ def search_lines(
         np.concatenate(features),
         candidates.delays_s * per_s,
         np.concatenate(windows),
-        bang / max(len(recording), 1),
+        np.asarray(bang / max(len(recording), 1), dtype=np.complex128),
         band.rate_hz,
         band.carrier_hz,
     )

@@ -58,13 +58,13 @@ def shift_windows(windows: Complexes, offset: Array) -> npt.NDArray[np.complex12
 
 def learn_pulse(windows: Complexes, offset: Array, chance: Array, rate_hz: float, transducer_hz: float) -> Pulse:
     """The pulse common to the sure echoes: their median after alignment in time, height and phase."""
-    sure = np.flatnonzero(chance > SURE)
+    sure: npt.NDArray[np.int64] = np.asarray(np.flatnonzero(chance > SURE), dtype=np.int64)
     if len(sure) < LEAST_LINES:
         u = np.arange(-BEFORE, BEHIND + 1) / rate_hz
         sigma = np.sqrt(2 * np.log(2)) / (np.pi * TYPICAL_BANDWIDTH * transducer_hz)
         return Pulse(np.exp(-0.25 * (u / sigma) ** 2).astype(complex), rate_hz, 0, 0.0, np.inf)
-    sure = sure[:: max(len(sure) // 512, 1)]
-    aligned = shift_windows(windows[sure], offset[sure])
+    some = sure[:: max(len(sure) // 512, 1)]
+    aligned = shift_windows(windows[some], offset[some])
     aligned = aligned / aligned[:, BEFORE : BEFORE + 1]
     typical = np.median(aligned.real, axis=0) + 1j * np.median(aligned.imag, axis=0)
     return Pulse(typical, rate_hz, len(sure), 0.0, np.inf)

@@ -70,7 +70,8 @@ def keep_agreeing(measurements: Lines, frames: npt.NDArray[np.int64]) -> npt.NDA
     along = measurements.positions_mm[frames] @ (beam / np.linalg.norm(beam))
     off = np.abs(along - np.median(along))
     spread = MEDIAN_TO_SD * float(np.median(off))
-    return frames[off <= max(OUTLIER_SDS * spread, LEAST_SPREAD_MM)]
+    agreeing: npt.NDArray[np.int64] = frames[off <= max(OUTLIER_SDS * spread, LEAST_SPREAD_MM)]
+    return agreeing
 
 
 def thin(positions: Array, qualities: Array) -> npt.NDArray[np.int64]:

@@ -102,5 +102,5 @@ def reasons_of(
         ("no echo", ~np.isfinite(depth_mm) | quiet | (likely < LIKELY)),
         ("doubtful echo", ~good),
     ]
-    chosen = np.select([case for _, case in cases], np.arange(len(cases)), default=len(cases) - 1)
+    chosen = np.select([case for _, case in cases], list(range(len(cases))), default=len(cases) - 1)
     return tuple(cases[index][0] for index in chosen.tolist())

@@ -72,8 +72,9 @@ def estimate_speed(recording: Recording, lines: LineMeasurements) -> SpeedEstima
             f"over {LEAST_RANGE_MM} mm of thickness; hold the probe on one place and vary the pressure slowly"
         )
     noise = LEAST_NOISE_MM
-    keep = [np.ones(len(spot.time_s), dtype=bool) for spot in spots]
-    speed, sums = lines.speed_of_sound_m_s, np.zeros((0, 2))
+    keep: list[npt.NDArray[np.bool_]] = [np.ones(len(spot.time_s), dtype=bool) for spot in spots]
+    speed = lines.speed_of_sound_m_s
+    sums: Array = np.zeros((0, 2))
     for _ in range(ROUNDS):
         sums = np.array([_sums(spot, mask, noise) for spot, mask in zip(spots, keep)])
         speed = float(sums[:, 0].sum() / sums[:, 1].sum()) * 1e-3
