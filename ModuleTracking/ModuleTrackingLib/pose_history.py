@@ -43,6 +43,11 @@ class PoseHistory:
     def latest(self) -> ToolPose | None:
         return self._poses[-1] if self._poses else None
 
+    def rate_hz(self, now_s: float, window_s: float = 1.0) -> float:
+        """Poses a second over the last `window_s`, missing ones left out."""
+        first = bisect.bisect_left(self._times, now_s - window_s)
+        return sum(pose.usable for pose in self._poses[first:]) / window_s
+
     def covers(self, time_s: float) -> bool:
         """Whether a pose at or after `time_s` is known, so that waiting longer would change nothing."""
         return bool(self._times) and self._times[-1] >= time_s

@@ -182,6 +182,11 @@ class PoseStream:
         names = tools or tuple(self._histories)
         return bool(names) and all(name in self._histories and self._histories[name].covers(time_s) for name in names)
 
+    def rate_hz(self, tool: str) -> float:
+        """How often the tool was seen in the last second."""
+        history = self._histories.get(tool)
+        return history.rate_hz(self._clock()) if history is not None else 0.0
+
     @property
     def tool_names(self) -> tuple[str, ...]:
         """Tools that have been reported, seen or missing."""

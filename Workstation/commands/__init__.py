@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from Workstation.commands import batch, demo, echo, evaluate, markers, plausibility, plugins, register, selftest, surface
+from Workstation.commands import batch, demo, echo, evaluate, markers, plausibility, plugins, register, selftest, surface, tracker
 from Workstation.commands import test as suite
 
 app = typer.Typer(
@@ -23,5 +23,6 @@ app.command("batch")(batch.batch)
 app.command("evaluate")(evaluate.evaluate)
 app.command("plausibility")(plausibility.plausibility)
 app.command("echo")(echo.echo)
+app.add_typer(tracker.app, name="tracker")
 app.command("selftest")(selftest.selftest)
 app.command("plugins")(plugins.plugins)
