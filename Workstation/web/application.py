@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import itertools
 from typing import Any
 
 from CranioNavLib import host
+from CranioNavLib.errors import InputError
 from CranioNavLib.panel import Panel
 from CranioNavLib.panel_model import PanelModel
 from trame.app import TrameApp
@@ -15,7 +18,8 @@ from Workstation.web.page import Page
 from Workstation.web.panel_view import PanelView
 from Workstation.web.procedure import PROCEDURE
 
-REFRESH_S = 0.2  # read-outs; the views redraw by themselves when a node changes
+POLL_S = 0.04  # devices: at least 20 updates a second reach the views
+REFRESH_EVERY = 5  # polls between two looks at the read-outs
 
 
 class WorkstationApp(TrameApp):
@@ -37,9 +41,12 @@ class WorkstationApp(TrameApp):
             self.layouts.set_layout("Quad View")
         self.runner = BackgroundRunner()
         self.panels: dict[str, PanelView] = {}
+        self._polled: list[Any] = []
         for panel, logic in _modules():
             key = panel.module.replace("Module", "").lower()
             self.panels[panel.module] = PanelView(self.server, PanelModel(panel, logic, self.runner), key)
+            if hasattr(logic, "poll"):
+                self._polled.append(logic)
         self.page = Page(self.server, self.panels, self.layouts, PROCEDURE)
         self.server.controller.on_server_ready.add_task(self._keep_fresh)
 
@@ -49,16 +56,32 @@ class WorkstationApp(TrameApp):
         return self.page.layout
 
     async def _keep_fresh(self, **_: Any) -> None:
-        while True:
-            await asyncio.sleep(REFRESH_S)
-            for panel in self.panels.values():
-                panel.refresh()
+        """Bring the devices' news into the scene, and the scene's into the panels."""
+        for turn in itertools.count():
+            await asyncio.sleep(POLL_S)
+            for logic in self._polled:
+                with contextlib.suppress(InputError):  # the logic keeps the reason and its panel shows it
+                    logic.poll()
+            if turn % REFRESH_EVERY == 0:
+                for panel in self.panels.values():
+                    panel.refresh()
 
 
 def _modules() -> list[tuple[Panel, Any]]:
     """Each module's panel with a logic on the host's scene."""
     from ModuleRegistrationLib.panel_description import PANEL as REGISTRATION
+    from ModuleTrackingLib.panel_description import PANEL as TRACKING
+    from ModuleUltrasoundLib.panel_description import PANEL as ULTRASOUND
 
     from ModuleRegistration import ModuleRegistrationLogic
+    from ModuleTracking import ModuleTrackingLogic
+    from ModuleUltrasound import ModuleUltrasoundLogic
+    from Workstation.web.simulated_hand import PANEL as HAND
+    from Workstation.web.simulated_hand import SimulatedHandLogic
 
-    return [(REGISTRATION, ModuleRegistrationLogic())]
+    return [
+        (REGISTRATION, ModuleRegistrationLogic()),
+        (TRACKING, ModuleTrackingLogic()),
+        (ULTRASOUND, ModuleUltrasoundLogic()),
+        (HAND, SimulatedHandLogic()),
+    ]

@@ -7,18 +7,32 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ProcedureStep:
-    """One entry of the stepper; its state is the most urgent of its parts."""
+    """One entry of the stepper; its state is that of its first part that is not done."""
 
     name: str
     title: str
     parts: tuple[tuple[str, str], ...]  # (module, step of its panel)
 
 
+REGISTRATION, TRACKING, ULTRASOUND, HAND = "ModuleRegistration", "ModuleTracking", "ModuleUltrasound", "SimulatedHand"
+
 PROCEDURE: tuple[ProcedureStep, ...] = (
-    ProcedureStep("ct", "CT", (("ModuleRegistration", "ct"),)),
-    ProcedureStep("bone", "Bone and markers", (("ModuleRegistration", "bone"),)),
-    ProcedureStep("landmarks", "Landmarks", (("ModuleRegistration", "landmarks"),)),
-    ProcedureStep("surface", "Surface", (("ModuleRegistration", "surface"),)),
-    ProcedureStep("verification", "Verification", (("ModuleRegistration", "verification"),)),
-    ProcedureStep("results", "Report and export", (("ModuleRegistration", "results"),)),
+    ProcedureStep("ct", "CT", ((HAND, "patient"), (REGISTRATION, "ct"))),
+    ProcedureStep("bone", "Bone and markers", ((REGISTRATION, "bone"),)),
+    ProcedureStep("devices", "Devices", ((TRACKING, "tracker"), (ULTRASOUND, "device"))),
+    ProcedureStep("calibration", "Calibration", ((TRACKING, "calibration"), (HAND, "pivot"))),
+    ProcedureStep("landmarks", "Landmarks", ((HAND, "landmarks"), (TRACKING, "points"), (REGISTRATION, "landmarks"))),
+    ProcedureStep(
+        "ultrasound",
+        "Ultrasound",
+        (
+            (ULTRASOUND, "protocol"),
+            (ULTRASOUND, "palpation"),
+            (HAND, "palpation"),
+            (ULTRASOUND, "measure"),
+            (REGISTRATION, "surface"),
+        ),
+    ),
+    ProcedureStep("verification", "Verification", ((HAND, "targets"), (REGISTRATION, "verification"))),
+    ProcedureStep("report", "Report and export", ((REGISTRATION, "results"),)),
 )

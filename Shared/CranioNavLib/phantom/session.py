@@ -315,6 +315,12 @@ def use_session(session: Optional[SimulatedSession]) -> None:
         _CURRENT[:] = [] if session is None else [session]
 
 
+def running_session() -> Optional[SimulatedSession]:
+    """The session in use; None when there is none."""
+    with _CURRENT_LOCK:
+        return _CURRENT[0] if _CURRENT else None
+
+
 def current_session(head: str = "sample", seed: int = 0) -> SimulatedSession:
     """The session in use; one is made (and kept) when there is none. `head`: "sample" or "synthetic".
 

@@ -1,0 +1,157 @@
+"""Without hardware: a patient on a simulated table and a hand that does what the buttons say, as one more panel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from CranioNavLib import scene, scene_data
+from CranioNavLib.errors import InputError
+from CranioNavLib.module_logic import ParametersInScene
+from CranioNavLib.panel import Action, Panel, ParameterField, Progress, Step, Task
+from CranioNavLib.parameters import Limits, Parameters
+from CranioNavLib.scripted_module import ScriptedLoadableModuleLogic
+from CranioNavLib.slicer_files import LabelledPoints
+
+
+@dataclass(frozen=True)
+class HandParameters(Parameters):
+    """What the simulation keeps in the scene."""
+
+    seed: Annotated[int, Limits(0, 2**31), "of the simulated patient and of every error"] = 0
+    dwell_s: Annotated[float, Limits(0.5, 20), "how long the hand stays on each palpation point"] = 2.5
+
+
+PANEL = Panel(
+    module="SimulatedHand",
+    title="Simulated hand",
+    parameters=HandParameters,
+    steps=(
+        Step(
+            "patient",
+            "Simulated patient",
+            "No CT or hardware at hand: lay a simulated patient with the sample head on the table. Tracker and probe are simulated too.",
+            (
+                ParameterField("seed"),
+                Action("layPatient", "Use the simulated patient", "Loads his CT and planned landmarks", primary=True),
+            ),
+        ),
+        Step(
+            "pivot",
+            "Simulated hand",
+            "Let the simulated hand pivot the stylus about a divot on the clamp, then press Pivot above.",
+            (Action("pivotStylus", "Hand: pivot the stylus"), Action("putAway", "Hand: put the tools away")),
+        ),
+        Step(
+            "landmarks",
+            "Simulated hand",
+            "Let the simulated hand put the stylus on the landmark that is asked for, then read the point.",
+            (Action("touchNextLandmark", "Hand: touch the next landmark"),),
+        ),
+        Step(
+            "palpation",
+            "Simulated hand",
+            "Let the simulated hand palpate the planned points one after another while the recording runs.",
+            (ParameterField("dwell_s"), Action("palpateAll", "Hand: palpate all points")),
+        ),
+        Step(
+            "targets",
+            "Simulated hand",
+            "Let the simulated hand seat the sphere tool on every target and read it: the ground truth.",
+            (Action("measureTargets", "Hand: measure the targets"),),
+        ),
+    ),
+)
+
+
+class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
+    """Tells the simulated session what to do; knows the other modules only by their nodes."""
+
+    parameterClass = HandParameters
+    sessionRole = "SimulationSession"
+
+    def layPatient(self) -> Task:
+        """Make the patient and put his planning CT and planned points into the scene."""
+        seed = self.parameters().read().seed
+
+        def make(progress: Progress) -> Any:
+            from CranioNavLib.phantom import make_patient
+            from CranioNavLib.phantom.session import SimulatedSession
+
+            from Workstation.demo_case import choose_head
+
+            progress("loading the head", 0.1)
+            volume, head = choose_head(None)
+            progress("simulating the patient", 0.3)
+            patient = make_patient(volume, seed)
+            progress("simulating his CT", 0.7)
+            return SimulatedSession(patient, seed), patient.planning_ct, head
+
+        return Task("Use the simulated patient", make, lambda made: self._take(*made))
+
+    def _take(self, session: Any, volume: Any, head: str) -> str:
+        from CranioNavLib.phantom.session import use_session
+
+        use_session(session)
+        patient = session.patient
+        for role in ("Bone", "OuterTable", "Skin", "LandmarksPatient", "SurfacePoints", "TargetsPatient", "PlausibilityPoints"):
+            scene.release(role)
+        scene_data.set_volume("CT", volume)
+        scene_data.set_points("LandmarksCT", LabelledPoints(patient.landmark_labels, patient.landmarks_ras_mm))
+        targets = tuple(f"Target {number + 1}" for number in range(len(patient.markers_ras_mm)))
+        scene_data.set_points("TargetsCT", LabelledPoints(targets, patient.markers_ras_mm))
+        return f"simulated patient: {head}"
+
+    def pivotStylus(self) -> str:
+        """Pivot the stylus until told otherwise."""
+        self._session().pivot()
+        return "the hand pivots the stylus"
+
+    def putAway(self) -> None:
+        """Take the tools out of view."""
+        for tool in ("Stylus", "Probe", "Sphere"):
+            self._session().put_away(tool)
+
+    def touchNextLandmark(self) -> str:
+        """Put the stylus on the first planned landmark that has not been digitised."""
+        session = self._session()
+        planned = scene_data.get_points("LandmarksCT").labels
+        node = scene.find("LandmarksPatient")
+        taken = {node.GetNthControlPointLabel(i) for i in range(node.GetNumberOfControlPoints())} if node is not None else set()
+        waiting = [label for label in planned if label not in taken]
+        if not waiting:
+            raise InputError("every landmark has been read; go on, or undo one")
+        labels = list(session.patient.landmark_labels)
+        if waiting[0] not in labels:
+            raise InputError(f"the simulated patient has no landmark {waiting[0]!r}; he has {', '.join(labels)}")
+        session.touch_landmark(labels.index(waiting[0]))
+        return f"the stylus goes to {waiting[0]}"
+
+    def palpateAll(self) -> str:
+        """Palpate the planned points one after another."""
+        session = self._session()
+        points = scene_data.get_points("ProtocolPoints")
+        columns = scene_data.read_measurements(scene.find("ProtocolPoints"))
+        normals = np.stack([columns[name] for name in ("Normal_R", "Normal_A", "Normal_S")], axis=1)
+        session.set_plan(points.positions_mm, normals)
+        seconds = session.palpate_plan(self.parameters().read().dwell_s)
+        return f"the hand palpates {len(points)} points; it takes {seconds:.0f} s"
+
+    def measureTargets(self) -> str:
+        """Digitise the targets as the sphere tool would, all at once."""
+        session = self._session()
+        positions = session.patient.digitise(
+            session.patient.markers_ras_mm, np.random.default_rng([self.parameters().read().seed, 0x7A]), 0.25
+        )
+        labels = scene_data.get_points("TargetsCT").labels
+        scene_data.set_points("TargetsPatient", LabelledPoints(labels, positions))
+        return f"{len(labels)} targets measured"
+
+    def _session(self) -> Any:
+        from CranioNavLib.phantom.session import running_session
+
+        session = running_session()
+        if session is None:
+            raise InputError("no simulated patient lies on the table; use one in step 1")
+        return session
