@@ -31,7 +31,7 @@ PANEL = Panel(
         Step(
             "patient",
             "Simulated patient",
-            "No CT or hardware at hand: lay a simulated patient with the sample head on the table. Tracker and probe are simulated too.",
+            "No CT or hardware at hand: lay a simulated patient with the sample head on the table, with tracker and probe.",
             (
                 ParameterField("seed"),
                 Action("layPatient", "Use the simulated patient", "Loads his CT and planned landmarks", primary=True),
