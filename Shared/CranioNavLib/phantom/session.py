@@ -222,7 +222,7 @@ class SimulatedSession:
         `noise` scales the tracker's error. Not `calibrated`: poses are of the tools' marker frames, their tips unknown.
         """
         base = self.reference_to_tracker(time_s)
-        reported: dict[str, Optional[Array]] = {REFERENCE: self._seen(REFERENCE, base, 0, noise)}
+        reported: dict[str, Optional[Array]] = {REFERENCE: self._seen(REFERENCE, base, self._count, noise)}
         for tool in TOOLS[1:]:
             pose = self.tool_to_reference(tool, time_s)
             if pose is None:
@@ -286,7 +286,7 @@ class SimulatedSession:
         return held.number if held is not None else 0
 
     def _seen(self, tool: str, true_pose: Array, number: int, noise: float) -> Array:
-        """A marker frame's pose with the tracker's error; its standing part belongs to the place where it is held."""
+        """A marker frame's pose with the tracker's error; its standing part is drawn anew with each thing the hand does."""
         standing = draw_error(np.random.default_rng([self._seed, TOOLS.index(tool), number]), 1)
         with self._lock:
             moving = draw_error(self._rng, 1)
