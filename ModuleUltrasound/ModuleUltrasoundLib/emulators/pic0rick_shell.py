@@ -36,6 +36,7 @@ class Pic0rickShell:
         self._typed = bytearray()
         self._buffer: npt.NDArray[np.int64] = np.zeros(LINE_SAMPLES, dtype=np.int64)
         self._gain_code = 0
+        self._scale = float("nan")  # converter steps a unit of the source
         self.commands: list[str] = []
 
     def greet(self) -> list[Chunk]:
@@ -112,6 +113,8 @@ class Pic0rickShell:
     def _converted(self, source: LineSource, onset: int, with_bang: bool) -> npt.NDArray[np.int64]:
         """A source's line as the board's converter gives it: gain, base line, noise, transmit pulse, clipping."""
         rate, line = source.acquisition.sampling_hz, source.next_line().astype(float)
+        if np.isnan(self._scale):
+            self._scale = _steps_a_unit(float(np.abs(line).max(initial=1.0)))
         gain = 10.0 ** ((gain_db_of_code(self._gain_code) - gain_db_of_code(REFERENCE_GAIN_CODE)) / 20.0)
         signal = CODE_MIDDLE - 3.0 + NOISE_CODES * self._rng.standard_normal(LINE_SAMPLES)
         times = np.arange(LINE_SAMPLES) - onset
@@ -119,8 +122,15 @@ class Pic0rickShell:
             after = np.maximum(times, 0) / RP2350_SAMPLING_HZ
             signal += np.where(times >= 0, BANG_CODES * np.exp(-after / BANG_DECAY_S) * np.cos(2 * np.pi * BANG_HZ * after), 0.0)
             zero = round(onset + ZERO_AFTER_BANG)
-            signal[zero:] += gain / STEPS_A_CODE * _resampled(line, rate, RP2350_SAMPLING_HZ, LINE_SAMPLES - zero)
+            signal[zero:] += gain * self._scale * _resampled(line, rate, RP2350_SAMPLING_HZ, LINE_SAMPLES - zero)
         return np.clip(np.round(signal), 0, 1023).astype(np.int64)
+
+
+def _steps_a_unit(largest: float) -> float:
+    """What a unit of a source's line is to the converter: a step, a sixteenth of one as the driver gives, or less."""
+    if largest <= CODE_MIDDLE:
+        return 1.0
+    return min(1.0 / STEPS_A_CODE, CODE_MIDDLE / largest)
 
 
 def _resampled(line: npt.NDArray[np.float64], rate_hz: float, wanted_hz: float, count: int) -> npt.NDArray[np.float64]:
