@@ -133,7 +133,8 @@ def _checked(marker_to_frame: npt.ArrayLike) -> Array:
     turn = poses[:, :3, :3]
     with np.errstate(invalid="ignore"):
         off = np.abs(np.swapaxes(turn, 1, 2) @ turn - np.eye(3)).max(axis=(1, 2))
-        doubtful = ~((off < 1e-6) & (np.linalg.det(turn) > 0) & np.isfinite(poses).all(axis=(1, 2)))
+        last = np.abs(poses[:, 3] - (0, 0, 0, 1)).max(axis=1)
+        doubtful = ~((off < 1e-6) & (last == 0) & (np.linalg.det(turn) > 0) & np.isfinite(poses).all(axis=(1, 2)))
     checked = poses.copy()
     for index in np.flatnonzero(doubtful):  # those few are mended, or refused with the reason
         checked[index] = check_rigid(poses[index], f"pose {index}")

@@ -213,7 +213,9 @@ class _Problem:
             rows, priors = self.misses(x)
             return np.concatenate([np.concatenate(rows)[keep[echo]], *priors])
 
-        parameters = least_squares(residuals, parameters, loss="soft_l1", x_scale="jac").x
+        # The problem is almost linear: plain least squares leads near from any start, and the robust loss from there.
+        parameters = least_squares(residuals, parameters, x_scale="jac").x
+        parameters = least_squares(residuals, parameters, loss="soft_l1", x_scale="jac", max_nfev=200).x
         for _ in range(20):
             lengths = np.sqrt(np.bincount(echo, np.concatenate(self.misses(parameters)[0]) ** 2, self.echoes))
             scale = max(MAD * float(np.median(lengths[keep])) / 1.2, 1.0)  # at least the stated errors
