@@ -17,6 +17,7 @@ from Workstation.web.background import BackgroundRunner
 from Workstation.web.page import Page
 from Workstation.web.panel_view import PanelView
 from Workstation.web.procedure import PROCEDURE
+from Workstation.web.views import ViewFollower
 
 POLL_S = 0.04  # devices: at least 20 updates a second reach the views
 REFRESH_EVERY = 5  # polls between two looks at the read-outs
@@ -47,6 +48,7 @@ class WorkstationApp(TrameApp):
             self.panels[panel.module] = PanelView(self.server, PanelModel(panel, logic, self.runner), key)
             if hasattr(logic, "poll"):
                 self._polled.append(logic)
+        self.views = ViewFollower(self.slicer)
         self.page = Page(self.server, self.panels, self.layouts, PROCEDURE)
         self.server.controller.on_server_ready.add_task(self._keep_fresh)
 
@@ -63,6 +65,7 @@ class WorkstationApp(TrameApp):
                 with contextlib.suppress(InputError):  # the logic keeps the reason and its panel shows it
                     logic.poll()
             if turn % REFRESH_EVERY == 0:
+                self.views.refresh()
                 for panel in self.panels.values():
                     panel.refresh()
 

@@ -7,7 +7,6 @@ from typing import Any
 from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import client, html
 from trame.widgets import vuetify3 as v3
-from trame_slicer.app.ui.flex_container import FlexContainer
 
 from Workstation.web.panel_view import PanelView
 from Workstation.web.procedure import ProcedureStep
@@ -16,6 +15,8 @@ SIGN_OF = "({ 'to do': '○', 'done': '✓', 'needs attention': '!' })"
 COLOR_OF = "({ 'to do': undefined, 'done': '#2fbf8f', 'needs attention': '#f0b429' })"
 STYLE = """
 html { overflow: hidden; }
+.views { display: flex; width: 100%; height: 100%; }
+.views div { min-width: 0; min-height: 0; }
 .v-application { font-size: 16px; }
 .step-sign { width: 26px; height: 26px; border-radius: 50%; border: 2px solid currentColor;
   text-align: center; line-height: 22px; font-weight: 700; }
@@ -35,7 +36,7 @@ class Page:
             self._draw_title()
             self._draw_steps(procedure)
             self._draw_open_step(procedure)
-            with v3.VMain(style="height: 100vh;"), FlexContainer(row=True, fill_height=True):
+            with v3.VMain(style="height: 100vh;"), html.Div(classes="views"):
                 layouts.initialize_layout_grid(self.layout)
 
     def _draw_title(self) -> None:
