@@ -1,0 +1,75 @@
+import numpy as np
+import pytest
+from CranioNavLib.rigid import rigid_from_vector
+from CranioNavLib.sequence_metafile import Acquisition, Recording
+from ModuleUltrasoundLib.quality import clipped_share, converter_limits, quality_of, reasons_of, unstable
+
+
+def a_recording(count=20, lines=None, statuses=None):
+    poses = np.tile(rigid_from_vector([0.0, 0, 0], [0.0, 0, 0]), (count, 1, 1))
+    lines = np.zeros((count, 600), dtype=np.int16) if lines is None else lines
+    return Recording(
+        lines, Acquisition(60e6, 5e6), poses, statuses or ("OK",) * count, np.arange(count) / 50, np.zeros(count, dtype=np.int64)
+    )
+
+
+def test_quality_adds_up_echoes_within_the_tolerance_and_the_timing():
+    depth = np.array([[6.0, 6.3, 9.0, np.nan]])
+    chance = np.array([[0.6, 0.2, 0.1, 0.0]])
+    assert quality_of(depth, np.array([0]), chance, np.array([0.01]))[0] == pytest.approx(0.8)
+    assert quality_of(depth, np.array([0]), chance, np.array([0.5]))[0] == pytest.approx(0.8 * 0.6827, abs=1e-4)
+    assert quality_of(depth, np.array([3]), chance, np.array([0.1]))[0] == 0
+
+
+def test_only_a_converters_ends_count_as_clipped():
+    wave = 2000 * np.sin(2 * np.pi * 5e6 * np.arange(600) / 60e6)
+    calm, loud = np.tile(wave, (2, 1)).astype(np.int16), np.clip(3 * wave, -2048, 2047).astype(np.int16)[None].repeat(2, 0)
+    assert converter_limits(calm)[1] > 32767
+    assert converter_limits(loud) == (-2048, 2047)
+    at = np.full(2, 5e-6)
+    assert clipped_share(a_recording(2, calm), at).max() == 0
+    assert clipped_share(a_recording(2, loud), at).min() > 0.3
+    assert clipped_share(a_recording(2, loud), np.full(2, np.nan)).max() == 0
+
+
+def test_jump_of_the_depth_under_a_resting_probe_is_unstable():
+    depth = np.full(20, 7.0)
+    depth[8] = 4.5
+    good = np.ones(20, dtype=bool)
+    assert np.flatnonzero(unstable(a_recording(), depth, good, np.zeros(20, dtype=int))).tolist() == [8]
+
+
+def test_pressing_is_no_instability():
+    recording = a_recording()
+    press = np.linspace(0, 1.9, 20)
+    recording.probe_to_reference[:, 2, 3] = press
+    assert not unstable(recording, 8.0 - press, np.ones(20, dtype=bool), np.zeros(20, dtype=int)).any()
+
+
+def reasons(**values):
+    given = {
+        "quality": 0.2, "clipped": False, "shaky": False, "depth_mm": 6.0, "line_snr_db": 30.0, "strength_db": 0.0,
+        "forerun_db": 0.0, "likely": 0.5, "status": "OK", **values,
+    }  # fmt: skip
+    one = {name: np.array([value]) for name, value in given.items() if name != "status"}
+    return reasons_of(a_recording(1, statuses=(given["status"],)), gate=0.8, **one)[0]
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ({"quality": 0.9}, ""),
+        ({"quality": 0.9, "status": "MISSING"}, "pose missing"),
+        ({"quality": 0.9, "status": "OUT_OF_VIEW"}, "pose out of view"),
+        ({"quality": 0.9, "status": "REQ_TIMEOUT"}, "pose invalid"),
+        ({"quality": 0.9, "clipped": True}, "saturated"),
+        ({"quality": 0.9, "shaky": True}, "unstable"),
+        ({"forerun_db": 12.0}, "no contact"),
+        ({"strength_db": -15.0}, "tilt too large"),
+        ({"depth_mm": np.nan, "likely": 0.0}, "no echo"),
+        ({"line_snr_db": 9.0}, "no echo"),
+        ({}, "doubtful echo"),
+    ],
+)
+def test_each_refusal_has_its_reason(values, reason):
+    assert reasons(**values) == reason
