@@ -89,9 +89,14 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         return "" if self.parameters().read().ct_path else "choose a DICOM folder or an image file first"
 
     def takeCt(self, volume):
-        """Make a CT (CranioNavLib.volume.Volume) the scene's; what was found in another one is removed."""
-        for role in ("Bone", "OuterTable", "Skin", "TargetsCT", "RegisteredPoints", "Results", "TargetErrors"):
+        """Make a CT (CranioNavLib.volume.Volume) the scene's; what was found in another one, and its registration, go."""
+        found = ("Bone", "OuterTable", "Skin", "LandmarksCT", "TargetsCT")
+        for role in (*found, "RegisteredPoints", "Results", "Residuals", "TargetErrors"):
             scene.release(role)
+        registration = scene.find("ReferenceToRas")
+        if registration is not None:
+            registration.RemoveAttribute(STATUS_ATTRIBUTE)
+            scene_data.set_transform("ReferenceToRas", [[float(row == column) for column in range(4)] for row in range(4)])
         scene_data.set_volume("CT", volume)
         return f"{volume.description}: {' × '.join(str(size) for size in volume.hu.shape[::-1])} voxels"
 

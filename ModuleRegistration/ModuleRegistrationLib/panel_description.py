@@ -69,7 +69,7 @@ PANEL = Panel(
             items=(
                 NodeField("LandmarksCT", "In the CT"),
                 NodeField("LandmarksPatient", "On the patient"),
-                ParameterField("landmark_fle_mm"),
+                ParameterField("landmark_fle_mm", "Usual error of a pair"),
                 Action("registerLandmarks", "Register landmarks", "First estimate of ReferenceToRas", primary=True),
                 ReadOut("fre", "FRE (RMS, not an accuracy)", "mm"),
             ),
@@ -81,7 +81,7 @@ PANEL = Panel(
             help="Lay the bone points measured by ultrasound or stylus on the skull.",
             items=(
                 NodeField("SurfacePoints", "Bone points"),
-                ParameterField("palpated_sd_mm"),
+                ParameterField("palpated_sd_mm", "Error of palpation"),
                 PluginField("method", "Method", METHODS.kind),
                 Action("registerSurface", "Register surface", "Refine ReferenceToRas and judge it", primary=True),
                 ReadOut("verdict", "Verdict", large=True),

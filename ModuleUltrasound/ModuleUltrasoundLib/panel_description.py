@@ -91,8 +91,8 @@ PANEL = Panel(
             help="Find the bone echo in every recorded line; good ones become bone points with their error.",
             items=(
                 ParameterField("speed_of_sound_m_s"),
-                ParameterField("speed_of_sound_sd_m_s"),
-                ParameterField("most_depth_mm"),
+                ParameterField("speed_of_sound_sd_m_s", "Its SD"),
+                ParameterField("most_depth_mm", "Deepest bone"),
                 ParameterField("quality_gate"),
                 Action("measureRecording", "Measure recording", "Read the recording and write SurfacePoints", primary=True),
                 NodeField("SurfacePoints", "Bone points"),

@@ -214,11 +214,12 @@ def _allow_bundles(package: Any, application_logic: Any) -> None:
 
 def __getattr__(name: str) -> Any:
     """`slicer` (with its scene ready) and the four base classes, resolved when first asked for."""
-    if name == "slicer":
-        scene()
-        return slicer_package()
-    if name in BASE_CLASSES:
-        scene()
-        home = "slicer.ScriptedLoadableModule" if in_application() else "CranioNavLib.scripted_module"
+    if name == "slicer" or name in BASE_CLASSES:
+        inside = in_application()
+        if not inside:
+            scene()
+        if name == "slicer":
+            return slicer_package()
+        home = "slicer.ScriptedLoadableModule" if inside else "CranioNavLib.scripted_module"
         return getattr(importlib.import_module(home), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

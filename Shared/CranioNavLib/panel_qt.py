@@ -128,6 +128,7 @@ class PanelWidget:
         if step.help:
             section.layout.addWidget(self._label(step.help))
         form = self.qt.QFormLayout()
+        form.setRowWrapPolicy(self.qt.QFormLayout.WrapLongRows)
         section.layout.addLayout(form)
         for item in step.items:
             self._add_item(item, form)

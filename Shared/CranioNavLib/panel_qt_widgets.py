@@ -154,9 +154,9 @@ class NodeChooser:
         self._ids: list[str] = []
         if host.in_application():
             self.widget = host.slicer_package().qMRMLNodeComboBox()
-            self.widget.setProperty("nodeTypes", [mrml_class])
-            for name, value in {"addEnabled": False, "removeEnabled": False, "renameEnabled": True, "noneEnabled": True}.items():
-                self.widget.setProperty(name, value)
+            self.widget.nodeTypes = [mrml_class]
+            self.widget.addEnabled = self.widget.removeEnabled = False
+            self.widget.renameEnabled = self.widget.noneEnabled = True
             self.widget.setMRMLScene(host.scene())
             connect(self.widget, "currentNodeChanged(vtkMRMLNode*)", self._node_chosen)
         else:
@@ -236,7 +236,7 @@ class Editor:
         elif isinstance(value, Enum):
             self.input.setCurrentIndex(list(type(value)).index(value))
         elif isinstance(value, str):
-            if self.input.property("text") != value and not self.input.hasFocus():  # not while the user types
+            if self.input.property("text") != value and not self.input.property("focus"):  # not while the user types
                 self.input.setText(value)
         else:
             self.input.setValue(value)
@@ -272,10 +272,16 @@ def _input_for(info: ParameterInfo) -> Any:
     spin = qt.QSpinBox() if kind == "int" else qt.QDoubleSpinBox()
     low, high = (info.limits.low, info.limits.high) if info.limits else (-NO_LIMIT, NO_LIMIT)
     if kind == "float":
-        spin.setDecimals(3)  # a thousandth of a millimetre, a degree or a second is below what anybody sets
+        spin.setDecimals(_decimals(info.default, high))
         spin.setRange(low, high)
     else:
         spin.setRange(max(int(low), -LARGEST_INT), min(int(high), LARGEST_INT))
     spin.setKeyboardTracking(False)
     spin.setSuffix(f" {info.unit}" if info.unit else "")
     return spin
+
+
+def _decimals(default: Any, high: float) -> int:
+    """As many as the default needs, and enough to set a hundredth of small quantities."""
+    shown = f"{default:.3f}".rstrip("0") if isinstance(default, float) else ""
+    return max(len(shown.partition(".")[2]), 2 if high <= 100 else 1)

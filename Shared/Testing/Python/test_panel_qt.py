@@ -221,7 +221,8 @@ def test_inside_the_application_slicers_own_widgets_are_used(monkeypatch, an_emp
     try:
         chosen = []
         chooser = panel_qt_widgets.NodeChooser("vtkMRMLModelNode", chosen.append)
-        assert chooser.widget.properties["nodeTypes"] == ["vtkMRMLModelNode"]
+        assert chooser.widget.nodeTypes == ["vtkMRMLModelNode"]
+        assert not chooser.widget.addEnabled
         assert ("setMRMLScene", (an_empty_scene,)) in chooser.widget.told
         node = an_empty_scene.AddNewNodeByClass("vtkMRMLModelNode", "m")
         chooser.widget.connected["currentNodeChanged(vtkMRMLNode*)"](node)

@@ -1,0 +1,180 @@
+"""The registration module's logic on the real scene: nodes in, nodes out, refusals kept apart from results."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from CranioNavLib import host, scene, scene_data
+from CranioNavLib.bone_points import BonePoints
+from CranioNavLib.errors import InputError
+from CranioNavLib.panel import Level, StepState
+from CranioNavLib.panel_model import PanelModel
+from CranioNavLib.rigid import invert_rigid, rigid_from_vector, transform_points
+from CranioNavLib.slicer_files import LabelledPoints, load_scene, read_transform, save_scene
+from CranioNavLib.surface import Surface
+from CranioNavLib.volume import Volume
+from ModuleRegistrationLib import result_tables as names
+from ModuleRegistrationLib.panel_description import PANEL
+from ModuleRegistrationLib.registration import verdict as verdicts
+
+import ModuleRegistration as module
+
+TRUTH = rigid_from_vector([0.3, -0.2, 0.4], [20, -30, 40])  # ReferenceToRas
+LABELS = ("Nasion", "Left", "Right", "Spine")
+LANDMARKS = np.array([[0.0, 92, 0], [-60, 45, 10], [60, 47, 12], [3, 78, -45]])
+
+
+@pytest.fixture(scope="module")
+def a_skull():
+    """A closed surface without symmetry, so that it has one best pose."""
+    import vtk
+
+    source = vtk.vtkSphereSource()
+    source.SetThetaResolution(120)
+    source.SetPhiResolution(90)
+    source.SetRadius(1.0)
+    source.Update()
+    egg = Surface.from_polydata(source.GetOutput())
+    x, y, z = egg.vertices_mm.T
+    bumps = 1 + 0.08 * np.sin(3 * x + y) + 0.06 * np.cos(4 * y - 2 * z) + 0.05 * np.sin(5 * z + x)
+    return Surface(egg.vertices_mm * bumps[:, None] * [72.0, 92.0, 85.0], egg.triangles)
+
+
+@pytest.fixture
+def a_logic():
+    host.scene().Clear(False)
+    logic = module.ModuleRegistrationLogic()
+    logic.parameters().change(method="icp")
+    yield logic
+    host.scene().Clear(False)
+
+
+@pytest.fixture
+def a_patient(a_logic, a_skull):
+    """Landmarks and bone points as touched on a patient whose true registration is TRUTH."""
+    rng = np.random.default_rng(0)
+    to_reference = invert_rigid(TRUTH)
+    scene_data.set_surface("Bone", a_skull)
+    scene_data.set_surface("OuterTable", a_skull)
+    scene_data.set_points("LandmarksCT", LabelledPoints(LABELS, LANDMARKS))
+    touched = transform_points(to_reference, LANDMARKS + rng.normal(0, 0.7, LANDMARKS.shape))
+    scene_data.set_points("LandmarksPatient", LabelledPoints(LABELS, touched))
+    bone = a_skull.vertices_mm[rng.choice(len(a_skull.vertices_mm), 40, replace=False)]
+    scene_data.set_bone_points(BonePoints.palpated(transform_points(to_reference, bone + rng.normal(0, 0.1, bone.shape)), 0.2))
+    targets = np.array([[0.0, 0, 60], [40, 20, 30], [-40, -20, 10]])
+    scene_data.set_points("TargetsCT", LabelledPoints(("t1", "t2", "t3"), targets))
+    scene_data.set_points(
+        "TargetsPatient", LabelledPoints(("t3", "t1", "t2"), transform_points(to_reference, targets)[[2, 0, 1]])
+    )
+    scene_data.set_points("PlausibilityPoints", LabelledPoints(("p",), transform_points(to_reference, bone[:1])))
+    return a_logic
+
+
+def worst_target_error():
+    targets = scene_data.get_points("TargetsCT").positions_mm
+    moved = transform_points(scene_data.get_transform("ReferenceToRas") @ invert_rigid(TRUTH), targets)
+    return np.linalg.norm(moved - targets, axis=1).max()
+
+
+def test_landmarks_then_surface_then_verification(a_patient):
+    said = a_patient.registerLandmarks()
+    assert "4 landmark pairs" in said
+    rough = worst_target_error()
+    assert a_patient.fre().level is Level.PLAIN, "a low FRE is no praise"
+    assert a_patient.surfaceStatus().state is StepState.TODO
+    a_patient.registerSurface().run()
+    assert worst_target_error() < min(rough, 0.3)
+    a_patient.verify()
+    errors = scene_data.get_table("TargetErrors")
+    assert errors["target"] == ["t1", "t2", "t3"], "paired by label"
+    assert max(errors["TRE (mm)"]) == pytest.approx(worst_target_error(), abs=1e-6)
+    rows = a_patient._rows()
+    assert float(rows[names.TRE_MAX]) == pytest.approx(max(errors["TRE (mm)"]), abs=1e-3)
+    assert float(rows[names.PLAUSIBILITY_MAX]) < 0.5
+    assert len(scene_data.get_table("Residuals")["point"]) == 40
+    series = scene.find("ResidualsSeries")
+    assert series.GetTableNode() is scene.find("Residuals")
+    assert scene.find("ResidualsChart").HasPlotSeriesNodeID(series.GetID())
+
+
+def test_a_saved_scene_shows_the_same_results(a_patient, tmp_path):
+    a_patient.registerLandmarks()
+    a_patient.registerSurface().run()
+    a_patient.verify()
+    model = PanelModel(PANEL, a_patient)
+    before = {step.name: model.status(step) for step in PANEL.steps}
+    readings = (a_patient.fre(), a_patient.verdict(), a_patient.measuredTre(), a_patient.predictedTre())
+    save_scene(tmp_path / "s.mrb")
+    load_scene(tmp_path / "s.mrb")
+    again = PanelModel(PANEL, module.ModuleRegistrationLogic())
+    assert {step.name: again.status(step) for step in PANEL.steps} == before
+    logic = again.logic
+    assert (logic.fre(), logic.verdict(), logic.measuredTre(), logic.predictedTre()) == readings
+    assert logic.parameters().read().method == "icp"
+    logic.verify()
+
+
+def test_a_refused_surface_registration_leaves_the_landmarks_and_says_so(a_patient, monkeypatch):
+    a_patient.registerLandmarks()
+    landmarks = scene_data.get_transform("ReferenceToRas")
+    refuse = lambda *_, **__: verdicts.Verdict("refused", ("the points lie on one line; palpate the left side",))  # noqa: E731
+    monkeypatch.setattr(verdicts, "judge", refuse)
+    with pytest.raises(InputError, match="palpate the left side"):
+        a_patient.registerSurface().run()
+    np.testing.assert_allclose(scene_data.get_transform("ReferenceToRas"), landmarks, atol=1e-12)
+    assert a_patient._status() == "landmarks"
+    assert a_patient.verdict().level is Level.BAD
+    assert a_patient.surfaceStatus().state is StepState.ATTENTION
+    assert scene.find("RegisteredPoints") is None
+
+
+def test_a_new_registration_forgets_what_was_measured_of_the_old_one(a_patient):
+    a_patient.registerLandmarks()
+    a_patient.registerSurface().run()
+    a_patient.verify()
+    a_patient.registerLandmarks()
+    assert a_patient.measuredTre() is None
+    assert a_patient.verdict() is None
+    for role in ("TargetErrors", "Residuals", "RegisteredPoints"):
+        assert scene.find(role) is None
+
+
+def test_a_new_ct_forgets_what_was_found_in_the_old_one(a_patient):
+    a_patient.registerLandmarks()
+    a_patient.takeCt(Volume(np.zeros((2, 3, 4), np.int16), np.eye(4), "another"))
+    for role in ("Bone", "OuterTable", "LandmarksCT", "TargetsCT", "Results"):
+        assert scene.find(role) is None, role
+    np.testing.assert_array_equal(scene_data.get_transform("ReferenceToRas"), np.eye(4))
+    assert a_patient.landmarkStatus().state is StepState.TODO
+
+
+def test_unpaired_landmarks_are_refused_and_nothing_is_written(a_patient):
+    points = scene_data.get_points("LandmarksPatient")
+    scene_data.set_points("LandmarksPatient", LabelledPoints(points.labels[:3], points.positions_mm[:3]))
+    with pytest.raises(InputError, match=r"3 patient and 4 CT"):
+        a_patient.registerLandmarks()
+    assert a_patient._status() == ""
+    assert scene.find("Results") is None
+
+
+def test_what_is_still_missing_is_named(a_logic):
+    assert a_logic.registerSurfaceBlocked() == "OuterTable, LandmarksCT, LandmarksPatient, SurfacePoints still missing"
+    assert a_logic.verifyBlocked() == "register first"
+    assert a_logic.segmentBoneBlocked() == "load a CT first"
+    assert a_logic.saveResultsBlocked() == "register first"
+
+
+def test_saved_results_are_read_back_as_the_scene_has_them(a_patient, tmp_path):
+    a_patient.registerLandmarks()
+    a_patient.parameters().change(output_folder=str(tmp_path / "out"))
+    a_patient.saveResults()
+    matrix = scene_data.get_transform("ReferenceToRas")
+    np.testing.assert_allclose(read_transform(tmp_path / "out" / "ReferenceToRas.tfm"), matrix, atol=1e-9)
+    load_scene(tmp_path / "out" / "scene.mrb")
+    np.testing.assert_allclose(scene_data.get_transform("ReferenceToRas"), matrix, atol=1e-9)
+
+
+def test_an_unknown_method_is_refused_with_those_that_are_installed(a_patient):
+    a_patient.parameters().change(method="magic")
+    with pytest.raises(InputError, match=r"unknown registration 'magic'; installed: .*icp"):
+        a_patient.registerSurface()

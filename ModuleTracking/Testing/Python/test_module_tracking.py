@@ -1,0 +1,250 @@
+"""The tracking module's logic on the real scene, with a tracker that does exactly what the test says."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from CranioNavLib import host, scene, scene_data
+from CranioNavLib.errors import InputError
+from CranioNavLib.panel import Level, StepState
+from CranioNavLib.parameters import Parameters
+from CranioNavLib.rigid import invert_rigid, rigid, rigid_from_vector
+from CranioNavLib.sequence_metafile import read_recording
+from CranioNavLib.slicer_files import LabelledPoints
+from ModuleTrackingLib.panel_description import PointList, Tool
+from ModuleTrackingLib.tracker import TRACKERS, PoseStatus, ToolInfo, ToolPose, Tracker, TrackerError
+
+import ModuleTracking as module
+
+BASE = rigid_from_vector([0.2, -0.1, 0.4], [30, -40, 1500])  # ReferenceToTracker
+TIP = np.array([1.0, -2.0, 120.0])  # of the stylus, in its marker's frame
+DIVOT = np.array([40.0, 25.0, 10.0])  # in Reference
+
+
+class Script:
+    """What the scripted tracker sees; shared by test and plugin."""
+
+    refuse = ""
+    broken = False
+    tools: dict = {}  # tool -> ToolToReference, or a function of the frame's number  # noqa: RUF012
+
+
+@TRACKERS.register
+class ScriptedTracker(Tracker):
+    name = "scripted"
+    title = "Scripted"
+
+    @dataclass(frozen=True)
+    class Settings(Parameters):
+        pass
+
+    def open(self):
+        if Script.refuse:
+            raise InputError(Script.refuse)
+        self.frame = 0
+
+    def start(self):
+        pass
+
+    def stop(self):
+        pass
+
+    def close(self):
+        pass
+
+    @property
+    def tools(self):
+        return [ToolInfo(name) for name in ("Reference", "Stylus", "Probe")]
+
+    def read(self, timeout_s=1.0):
+        time.sleep(0.004)
+        if Script.broken:
+            raise TrackerError("the cable fell out; plug it in")
+        self.frame += 1
+        now = time.monotonic()
+        poses = [ToolPose("Reference", BASE, PoseStatus.OK, now, frame_number=self.frame)]
+        for name in ("Stylus", "Probe"):
+            pose = Script.tools.get(name)
+            pose = pose(self.frame) if callable(pose) else pose
+            status = PoseStatus.OK if pose is not None else PoseStatus.MISSING
+            poses.append(ToolPose(name, None if pose is None else BASE @ pose, status, now, frame_number=self.frame))
+        return poses
+
+
+def pivoting(frame):
+    """The stylus' marker while its tip rests in the divot."""
+    turn = rigid_from_vector([0.5 * np.sin(frame / 7), 0.5 * np.sin(frame / 11), 0.3 * np.sin(frame / 5)], np.zeros(3))
+    return rigid(np.eye(3), DIVOT) @ turn @ rigid(np.eye(3), -TIP)
+
+
+@pytest.fixture
+def a_logic():
+    host.scene().Clear(False)
+    Script.refuse, Script.broken, Script.tools = "", False, {"Stylus": rigid(np.eye(3), DIVOT)}
+    logic = module.ModuleTrackingLogic()
+    logic.parameters().change(tracker="scripted", rest_s=0.1)
+    yield logic
+    logic.disconnect()
+    host.scene().Clear(False)
+
+
+def run_until(logic, done, limit_s=10.0):
+    end = time.monotonic() + limit_s
+    while time.monotonic() < end:
+        logic.poll()
+        if done():
+            return
+        time.sleep(0.005)
+    raise AssertionError("waited in vain")
+
+
+def seen(tool="Stylus"):
+    return lambda: scene_data.get_pose(f"{tool}ToReference").matrix is not None
+
+
+def run_for(logic, seconds):
+    end = time.monotonic() + seconds
+    run_until(logic, lambda: time.monotonic() > end)
+
+
+def test_poses_reach_the_scene_relative_to_the_reference_base(a_logic):
+    a_logic.connect()
+    run_until(a_logic, seen())
+    np.testing.assert_allclose(scene_data.get_transform("StylusToReference")[:3, 3], DIVOT, atol=1e-9)
+    np.testing.assert_allclose(scene_data.get_transform("ReferenceToTracker"), BASE, atol=1e-9)
+    assert scene.find("StylusToReference").GetParentTransformNode() is scene.find("ReferenceToRas")
+    run_for(a_logic, 0.05)
+    assert a_logic.connection().level is Level.GOOD
+    assert a_logic.stylusTool().text == "OK"
+    assert a_logic.trackerStatus().state is StepState.DONE
+
+
+def test_a_lost_tool_has_no_pose_in_the_scene(a_logic):
+    a_logic.connect()
+    run_until(a_logic, seen())
+    Script.tools = {}
+    run_until(a_logic, lambda: scene_data.get_pose("StylusToReference").status == "MISSING")
+    assert scene_data.get_pose("StylusToReference").matrix is None
+    assert a_logic.stylusTool().level is Level.BAD
+
+
+def test_a_tracker_that_fails_loses_all_tools_and_comes_back_by_itself(a_logic):
+    a_logic.connect()
+    run_until(a_logic, seen())
+    Script.broken = True
+    run_until(a_logic, lambda: not a_logic.stream.state.connected)
+    run_until(a_logic, lambda: scene_data.get_pose("StylusToReference").matrix is None)
+    assert "cable" in a_logic.connection().text
+    Script.broken = False
+    run_until(a_logic, seen())
+
+
+def test_a_tracker_that_refuses_its_settings_says_so_and_can_be_tried_again(a_logic):
+    Script.refuse = "no such port COM9; give another"
+    a_logic.connect()
+    with pytest.raises(InputError, match="COM9"):
+        run_until(a_logic, lambda: False)
+    assert a_logic.stream is None
+    assert "COM9" in a_logic.connection().text
+    assert a_logic.trackerStatus().state is StepState.ATTENTION
+    assert a_logic.connectBlocked() == ""
+
+
+def test_pivoting_calibrates_the_tip_and_the_scene_shows_it_from_then_on(a_logic):
+    Script.tools = {"Stylus": pivoting}
+    a_logic.connect()
+    run_until(a_logic, seen())
+    a_logic.parameters().change(pivot_s=1.0)
+    a_logic.startPivot()
+    assert a_logic.digitiseBlocked() == "a tool is being pivoted"
+    run_until(a_logic, lambda: "Stylus" in a_logic._calibrated)
+    np.testing.assert_allclose(a_logic._calibrated["Stylus"].tip_in_marker_mm, TIP, atol=1e-6)
+    run_for(a_logic, 0.1)
+    np.testing.assert_allclose(scene_data.get_transform("StylusToReference")[:3, 3], DIVOT, atol=1e-6)
+    assert a_logic.calibrationStatus().state is StepState.DONE
+
+
+def test_a_tool_held_still_cannot_be_calibrated_and_the_panel_says_why(a_logic):
+    a_logic.connect()
+    run_until(a_logic, seen())
+    a_logic.parameters().change(pivot_s=1.0)
+    a_logic.startPivot()
+    run_until(a_logic, lambda: a_logic._pivot is None)
+    assert "Stylus" not in a_logic._calibrated
+    assert "tilt" in a_logic.pivotProgress().text
+    assert a_logic.calibrationStatus().state is StepState.ATTENTION
+
+
+def test_points_get_the_planned_labels_in_order_and_can_be_undone(a_logic):
+    planned = LabelledPoints(("Nasion", "Left", "Right"), np.eye(3) * 50)
+    scene_data.set_points("LandmarksCT", planned)
+    a_logic.connect()
+    for label in planned.labels:
+        run_for(a_logic, 0.15)
+        assert a_logic.nextPoint().text == label
+        a_logic.digitise()
+    touched = scene_data.get_points("LandmarksPatient")
+    assert touched.labels == planned.labels
+    np.testing.assert_allclose(touched.positions_mm, [DIVOT] * 3, atol=1e-9)
+    assert a_logic.pointsStatus().state is StepState.DONE
+    assert a_logic.undoPoint() == "Right removed"
+    assert a_logic.nextPoint().text == "Right"
+    assert "Right" in a_logic.pointsStatus().text
+
+
+def test_a_moving_tip_is_no_point(a_logic):
+    Script.tools = {"Stylus": lambda frame: rigid(np.eye(3), DIVOT + [frame, 0, 0])}
+    a_logic.connect()
+    run_until(a_logic, seen())
+    run_for(a_logic, 0.2)
+    with pytest.raises(InputError, match="hold it still"):
+        a_logic.digitise()
+    assert scene.find("LandmarksPatient") is None
+
+
+def test_a_tool_out_of_view_is_no_point(a_logic):
+    a_logic.connect()
+    run_until(a_logic, seen())
+    Script.tools = {}
+    run_until(a_logic, lambda: scene_data.get_pose("StylusToReference").matrix is None)
+    with pytest.raises(InputError, match="stylus has no pose"):
+        a_logic.digitise()
+
+
+def test_points_go_to_the_list_that_is_chosen(a_logic):
+    a_logic.connect()
+    a_logic.parameters().change(points=PointList.PLAUSIBILITY, tool=Tool.STYLUS)
+    run_for(a_logic, 0.2)
+    a_logic.digitise()
+    assert scene_data.get_points("PlausibilityPoints").labels == ("P1",)
+    assert scene.find("LandmarksPatient") is None
+
+
+def test_what_is_recorded_is_what_was_seen(a_logic, tmp_path):
+    Script.tools = {"Stylus": rigid(np.eye(3), DIVOT), "Probe": rigid(np.eye(3), [1, 2, 3])}
+    a_logic.connect()
+    run_until(a_logic, seen("Probe"))
+    a_logic.parameters().change(recording_path=str(tmp_path / "all.igs.mha"))
+    a_logic.startRecording()
+    run_for(a_logic, 0.4)
+    assert "frames" in a_logic.recording().text
+    assert "all.igs.mha" in a_logic.stopRecording()
+    recording = read_recording(tmp_path / "all.igs.mha")
+    assert len(recording) > 5
+    np.testing.assert_allclose(recording.probe_to_reference[0], rigid(np.eye(3), [1, 2, 3]), atol=1e-6)
+    np.testing.assert_allclose(recording.other_transforms["ReferenceToTracker"][0], BASE, atol=1e-6)
+    stylus = recording.other_transforms["StylusToTracker"][0]
+    np.testing.assert_allclose((invert_rigid(BASE) @ stylus)[:3, 3], DIVOT, atol=1e-6)
+
+
+def test_after_disconnecting_nothing_is_live(a_logic):
+    a_logic.connect()
+    run_until(a_logic, seen())
+    a_logic.disconnect()
+    a_logic.poll()
+    assert scene_data.get_pose("StylusToReference").matrix is None
+    assert a_logic.stylusTool() is None
+    assert a_logic.digitiseBlocked() == "connect the tracker first"

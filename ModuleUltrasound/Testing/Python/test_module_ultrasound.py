@@ -1,0 +1,200 @@
+"""The ultrasound module's logic on the real scene: protocol, live lines, recording, bone points."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from CranioNavLib import host, scene, scene_data
+from CranioNavLib.errors import InputError
+from CranioNavLib.panel import Level, StepState
+from CranioNavLib.parameters import Parameters
+from CranioNavLib.rigid import rigid
+from CranioNavLib.sequence_metafile import Acquisition, read_recording
+from CranioNavLib.slicer_files import LabelledPoints, load_scene, save_scene
+from CranioNavLib.surface import Surface
+from ModuleUltrasoundLib.device import AMODE_DEVICES, AModeDevice, RfLine
+
+import ModuleUltrasound as module
+
+RATE_HZ, CARRIER_HZ, SPEED_M_S = 50e6, 5e6, 1540.0
+DEPTH_MM = 6.0
+POSE = rigid(np.diag([1.0, -1.0, -1.0]), [5.0, 6.0, 50.0])  # the beam points down
+
+
+def echo_line(depth_mm, rng):
+    """Transmit pulse, skin at 1 mm, bone at `depth_mm` below the transducer, noise: no forerun."""
+    times = np.arange(1500) / RATE_HZ
+    samples = rng.normal(0, 20, len(times))
+    for mm, amplitude, seconds in ((0.0, 20000, 2e-7), (depth_mm, 8000, 2.5e-7)):
+        late = times - 2e-3 * mm / SPEED_M_S
+        samples += amplitude * np.exp(-((late / seconds) ** 2)) * np.cos(2 * np.pi * CARRIER_HZ * late)
+    return np.clip(samples, -32768, 32767).astype(np.int16)
+
+
+@AMODE_DEVICES.register
+class EchoDevice(AModeDevice):
+    name = "one-echo"
+    title = "One echo"
+
+    @dataclass(frozen=True)
+    class Settings(Parameters):
+        pass
+
+    refuse = ""
+
+    def open(self):
+        if EchoDevice.refuse:
+            raise InputError(EchoDevice.refuse)
+        self.rng = np.random.default_rng(0)
+
+    def start(self):
+        pass
+
+    def stop(self):
+        pass
+
+    def close(self):
+        pass
+
+    @property
+    def acquisition(self):
+        return Acquisition(RATE_HZ, CARRIER_HZ)
+
+    def read(self, timeout_s=1.0):
+        time.sleep(0.01)
+        return RfLine(echo_line(DEPTH_MM, self.rng), time.monotonic())
+
+
+@pytest.fixture
+def a_logic():
+    host.scene().Clear(False)
+    EchoDevice.refuse = ""
+    logic = module.ModuleUltrasoundLogic()
+    logic.parameters().change(device="one-echo")
+    yield logic
+    logic.disconnect()
+    host.scene().Clear(False)
+
+
+@pytest.fixture(scope="module")
+def a_head():
+    """An egg of a head's size, finely meshed, in RAS."""
+    import vtk
+
+    source = vtk.vtkSphereSource()
+    source.SetThetaResolution(160)
+    source.SetPhiResolution(120)
+    source.SetRadius(1.0)
+    source.Update()
+    egg = Surface.from_polydata(source.GetOutput())
+    return Surface(egg.vertices_mm * [72.0, 92.0, 85.0], egg.triangles)
+
+
+def run_for(logic, seconds, pose=POSE, status="OK"):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        scene_data.set_pose("ProbeToReference", pose, status, time.monotonic())
+        logic.poll()
+        time.sleep(0.01)
+
+
+def test_the_protocol_is_planned_and_survives_a_saved_scene(a_logic, a_head, tmp_path):
+    scene_data.set_surface("OuterTable", a_head)
+    assert a_logic.planProtocol() == "18 points"
+    positions, normals, labels = a_logic.protocolPoints()
+    assert a_head.closest(positions).distances_mm.max() < 0.5
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+    a_logic.nextPoint()
+    save_scene(tmp_path / "s.mrb")
+    load_scene(tmp_path / "s.mrb")
+    assert a_logic.currentIndex() == 1
+    again = a_logic.protocolPoints()
+    np.testing.assert_allclose(again[1], normals, atol=1e-9)
+    assert again[2] == labels
+    assert a_logic.currentPoint().text == f"2. {labels[1]}"
+
+
+def test_going_on_and_back_stays_within_the_protocol(a_logic, a_head):
+    assert a_logic.nextPointBlocked() == "plan the points first"
+    scene_data.set_surface("OuterTable", a_head)
+    a_logic.planProtocol()
+    a_logic.previousPoint()
+    assert a_logic.currentIndex() == 0
+    for _ in range(30):
+        a_logic.nextPoint()
+    assert a_logic.currentIndex() == 17
+
+
+def test_points_edited_by_hand_are_planned_again(a_logic, a_head):
+    scene_data.set_surface("OuterTable", a_head)
+    a_logic.planProtocol()
+    scene.find("ProtocolPoints").AddControlPoint([0.0, 0.0, 85.0], "mine")
+    with pytest.raises(InputError, match="plan them again"):
+        a_logic.protocolPoints()
+
+
+def test_live_lines_are_shown_and_need_the_probes_pose(a_logic):
+    assert a_logic.probePose().level is Level.BAD
+    a_logic.connect()
+    run_for(a_logic, 1.0)
+    assert a_logic.deviceStatus().state is StepState.DONE
+    table = scene_data.get_table("ALine")
+    assert len(table["amplitude"]) == 1500
+    assert table["time (µs)"][1] == pytest.approx(0.02)
+    assert a_logic.depth() is not None
+    assert a_logic.probePose().level is Level.GOOD
+
+
+def test_a_recording_holds_every_line_with_its_pose_and_point(a_logic, a_head, tmp_path):
+    scene_data.set_surface("OuterTable", a_head)
+    a_logic.planProtocol()
+    a_logic.parameters().change(recording_path=str(tmp_path / "r.igs.mha"))
+    a_logic.connect()
+    assert a_logic.startRecordingBlocked() == "no line has come yet"
+    run_for(a_logic, 0.4)
+    a_logic.startRecording()
+    assert a_logic.measureRecordingBlocked() == "stop the recording first"
+    run_for(a_logic, 0.4)
+    a_logic.nextPoint()
+    run_for(a_logic, 0.4)
+    a_logic._closeRecording()
+    recording = read_recording(tmp_path / "r.igs.mha")
+    assert len(recording) > 20
+    assert set(recording.palpation_points.tolist()) == {0, 1}
+    ok = np.array([status == "OK" for status in recording.statuses])
+    assert ok.sum() > 0.8 * len(ok)
+    np.testing.assert_allclose(recording.probe_to_reference[ok], np.tile(POSE, (ok.sum(), 1, 1)), atol=1e-6)
+
+
+def test_lines_of_a_lost_probe_are_recorded_without_a_pose(a_logic, tmp_path):
+    a_logic.parameters().change(recording_path=str(tmp_path / "r.igs.mha"))
+    a_logic.connect()
+    run_for(a_logic, 0.3)
+    a_logic.startRecording()
+    run_for(a_logic, 0.2)
+    run_for(a_logic, 0.5, pose=None, status="MISSING")
+    a_logic._closeRecording()
+    recording = read_recording(tmp_path / "r.igs.mha")
+    assert recording.statuses[-1] == "MISSING"
+    assert np.isnan(recording.probe_to_reference[-1]).all()
+
+
+def test_a_device_that_refuses_its_settings_says_so(a_logic):
+    EchoDevice.refuse = "no such port COM9; give another"
+    a_logic.connect()
+    with pytest.raises(InputError, match="COM9"):
+        run_for(a_logic, 3.0)
+    assert a_logic.stream is None
+    assert "COM9" in a_logic.connection().text
+    assert a_logic.connectBlocked() == ""
+
+
+def test_a_missing_recording_is_refused_and_changes_nothing(a_logic, tmp_path):
+    scene_data.set_points("SurfacePoints", LabelledPoints(("a",), np.zeros((1, 3))))
+    a_logic.parameters().change(recording_path=str(tmp_path / "none.igs.mha"))
+    with pytest.raises(InputError, match=r"none\.igs\.mha"):
+        a_logic.measureRecording().run()
+    assert scene_data.get_points("SurfacePoints").labels == ("a",)
