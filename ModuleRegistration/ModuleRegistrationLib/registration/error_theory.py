@@ -89,8 +89,8 @@ def length_statistics(covariances_mm2: npt.ArrayLike, degrees_of_freedom: Option
     The square of the length is a weighted sum of three chi-square variables; its quantile is read from a table
     over the ratios of the three SDs that was integrated numerically (error below 0.1%).
     """
-    variances = np.maximum(np.linalg.eigvalsh(np.asarray(covariances_mm2, dtype=float)), 0.0)
-    sds = np.sqrt(variances)
+    variances: Array = np.maximum(np.linalg.eigvalsh(np.asarray(covariances_mm2, dtype=float)), 0.0)
+    sds: Array = np.sqrt(variances)
     largest = np.maximum(sds[..., 2], 1e-300)
     means, quantiles = _length_tables()
     middle, small = sds[..., 1] / largest, sds[..., 0] / largest

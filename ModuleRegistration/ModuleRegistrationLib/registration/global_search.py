@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from CranioNavLib.rigid import Array, rigid_from_vector
 
 from ModuleRegistrationLib.registration.landmarks import motion_jacobian
@@ -57,7 +58,7 @@ def search(model: Model, rng: np.random.Generator, stages: tuple[Stage, ...] = S
     return state.take(order), score[order], steps
 
 
-def distinct(model: Model, state: State, order: Array) -> Array:
+def distinct(model: Model, state: State, order: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """Of the poses in `order`, those that are not within SAME_PLACE_MM of a better one."""
     points = model.points @ np.swapaxes(state.motion[order, :3, :3], -1, -2) + state.motion[order, None, :3, 3]
     apart = np.sqrt(((points[:, None] - points[None]) ** 2).sum(axis=-1).mean(axis=-1))
@@ -65,4 +66,5 @@ def distinct(model: Model, state: State, order: Array) -> Array:
     for i in range(len(order)):
         if not kept or apart[i, kept].min() > SAME_PLACE_MM:
             kept.append(i)
-    return order[np.array(kept)]
+    chosen: npt.NDArray[np.int64] = order[np.array(kept)]
+    return chosen

@@ -129,7 +129,7 @@ def register_landmarks(
         residual_vectors_mm=misses,
         fle_mm=float(np.sqrt(3 * variance)),
         degrees_of_freedom=freedom,
-        covariance=variance * np.linalg.inv(jacobian.T @ jacobian),
+        covariance=np.asarray(variance * np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64),
         pivot_ras_mm=pivot,
         labels=tuple(labels),
         warnings=warnings,

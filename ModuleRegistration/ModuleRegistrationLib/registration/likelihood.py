@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 from CranioNavLib.rigid import Array, rigid_from_vector, transform_points
 from CranioNavLib.surface import Surface
 
@@ -23,6 +24,7 @@ PARAMETERS = 8  # rotation, translation, offset, speed
 OUTLIER_WIDTH_MM = 3.0  # of the Cauchy law of outliers: another tissue interface lies 2-8 mm away
 OUTLIER_PRIOR = (1.0, 12.0)  # pseudo-counts of outliers and of points: about one in twelve before any data
 SCALE_FREEDOM = 6.0  # what the stated variances are worth, in points: right to a factor of two or so
+LEAST_SCALE = 0.2  # of the variances: nothing measures much better than it says
 LANDMARK_SD_MM, LANDMARK_FREEDOM = 2.5, 1.0  # per axis; the prior is so broad that 1 mm and 8 mm are both likely
 LEAST_QUALITY = 0.3
 START_SD_MM = 10.0  # without landmarks the given start is believed to this, at the extent of a head
@@ -48,11 +50,10 @@ class Model:
     pivot: Array  # (3,)
     alternatives: Array  # (N, K) mm along the beam from the chosen echo; NaN pads
     alternative_log_odds: Array  # (N, K) against the chosen echo
-    bias: Array  # (N,) mm, expected residual: what points of one sweep or one spot share
 
-    def subset(self, index: Array) -> Model:
+    def subset(self, index: npt.NDArray[np.int64]) -> Model:
         """The same model with some of the points."""
-        names = ("points", "beams", "depths", "covariances", "inlier_prior", "alternatives", "alternative_log_odds", "bias")
+        names = ("points", "beams", "depths", "covariances", "inlier_prior", "alternatives", "alternative_log_odds")
         return replace(self, **{name: getattr(self, name)[index] for name in names})
 
 
@@ -66,7 +67,7 @@ class State:
     scale: Array  # (M,) factor on the points' variances
     outliers: Array  # (M,) share
 
-    def take(self, index: Array) -> State:
+    def take(self, index: npt.NDArray[np.int64]) -> State:
         """Some of the poses."""
         return State(self.motion[index], self.offset[index], self.speed[index], self.scale[index], self.outliers[index])
 
@@ -116,7 +117,6 @@ def prepare(problem: RegistrationProblem) -> Model:
         pivot=moved.positions_mm.mean(axis=0),
         alternatives=moved.alternative_depths_mm - moved.depths_mm[:, None],
         alternative_log_odds=_log_odds(moved.alternative_probabilities),
-        bias=np.zeros(len(moved)),
     )
 
 
@@ -134,7 +134,7 @@ def evaluate(model: Model, state: State) -> Evaluation:
     points = transform_points(state.motion, model.points) + beams * (model.depths * state.speed[:, None])[..., None]
     feet = find_feet(model.surface, points.reshape(-1, 3))
     normals = feet.directions.reshape(count, number, 3)
-    residuals = feet.distances_mm.reshape(count, number) - state.offset[:, None] - model.bias
+    residuals = feet.distances_mm.reshape(count, number) - state.offset[:, None]
     back = (normals[..., None, :] @ turn)[..., 0, :]  # the normal as the measurement sees it
     variances = (back * (model.covariances @ back[..., None])[..., 0]).sum(axis=-1) + model.surface_variance
     slope = (normals * beams).sum(axis=-1)
@@ -240,6 +240,7 @@ def update_scales(model: Model, found: Evaluation, hessian: Array) -> tuple[Arra
     taken = np.clip(leverage * found.weights, 0, 0.95)
     squares = (inlier * found.residuals**2 / found.variances).sum(axis=1)
     scale = (squares + SCALE_FREEDOM) / ((inlier * (1 - taken)).sum(axis=1) + SCALE_FREEDOM)
+    scale = np.maximum(scale, LEAST_SCALE)
     bad, points = OUTLIER_PRIOR
     outliers = ((1 - inlier).sum(axis=1) + bad) / (len(model.points) + points)
     return scale, outliers

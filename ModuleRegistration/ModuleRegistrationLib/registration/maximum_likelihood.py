@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from CranioNavLib.rigid import Array
 
 from ModuleRegistrationLib.registration.global_search import Stage, distinct, search
@@ -14,7 +15,7 @@ from ModuleRegistrationLib.registration.problem import Minimum, RegistrationProb
 from ModuleRegistrationLib.registration.shared_errors import refine
 
 DENSE = 60  # points; beyond, the posterior is Gaussian and what points share decides the accuracy
-SEARCH_POINTS = 60
+SEARCH_POINTS = 40
 PLAUSIBLE_SCORE = 6.0  # a minimum e^6 less likely than the best is not looked at again
 MOST_MINIMA = 4
 POLISH_STEPS, POLISH_STEP_MM, POLISHED_MM = 12, 2.0, 1e-2
@@ -53,7 +54,7 @@ def solve(problem: RegistrationProblem, stages: tuple[Stage, ...], samples: int)
     return _result(problem, model, solution)
 
 
-def spread_points(points: Array, count: int) -> Array:
+def spread_points(points: Array, count: int) -> npt.NDArray[np.int64]:
     """Indices of `count` points spread evenly over the cloud: each next one the farthest from those before."""
     chosen = [0]
     distances = np.linalg.norm(points - points[0], axis=1)
@@ -73,7 +74,8 @@ def polish(model: Model, minima: State) -> tuple[State, Array, Array, int]:
     hessian, _ = normal_equations(model, minima, found)
     scores = found.cost + np.linalg.slogdet(hessian)[1] / 2
     order = distinct(model, minima, np.argsort(scores))
-    return minima.take(order), scores[order], np.linalg.inv(hessian[order]), steps
+    covariances = np.asarray(np.linalg.inv(hessian[order]), dtype=np.float64)
+    return minima.take(order), scores[order], covariances, steps
 
 
 def _solve_sparse(

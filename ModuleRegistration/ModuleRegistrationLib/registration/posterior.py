@@ -60,7 +60,7 @@ def sample_posterior(
     share = share / share.sum()
     origin = rng.choice(len(share), size=count, p=share)
     origin[: len(share)] = np.arange(len(share))
-    roots = np.linalg.cholesky(covariances[:, :size, :size] * PROPOSAL_STRETCH**2)
+    roots = np.asarray(np.linalg.cholesky(covariances[:, :size, :size] * PROPOSAL_STRETCH**2), dtype=np.float64)
     heavy = np.sqrt(PROPOSAL_FREEDOM / rng.chisquare(PROPOSAL_FREEDOM, count))
     draws = (roots[origin] @ rng.standard_normal((count, size, 1)))[..., 0] * heavy[:, None]
     state = State(
@@ -105,6 +105,6 @@ def _moments(model: Model, minima: State, state: State, weight: Array, nearest: 
         offset_mm=float(weight @ state.offset),
         speed=speed,
         speed_sd=float(np.sqrt(weight @ (state.speed - speed) ** 2)),
-        probabilities=probabilities,
+        probabilities=np.asarray(probabilities, dtype=np.float64),
         effective_samples=float(1 / np.sum(weight**2)),
     )
