@@ -38,7 +38,8 @@ class WorkstationApp(TrameApp):
             host.adopt_scene(self.slicer.scene, self.slicer.app_logic)
             register_rca_factories(self.slicer.view_manager, self.server)
             self.layouts = LayoutManager(self.slicer.scene, self.slicer.view_manager, self.server)
-            self.layouts.register_layout_dict(LayoutManager.default_grid_configuration(), lazy_initialization=True)
+            # the views are made here: made inside the page, their widgets would land between the page's own
+            self.layouts.register_layout_dict(LayoutManager.default_grid_configuration())
             self.layouts.set_layout("Quad View")
         self.runner = BackgroundRunner()
         self.panels: dict[str, PanelView] = {}
