@@ -26,7 +26,9 @@ FAILURES_FOR_LOSS = 3
 LOST_AFTER_S = 0.5  # damaged replies for this long, and at least three of them
 WRAP = 2**32
 FRAMES_TO_LEARN, KEPT_FRAMES = 16, 60  # for the pace of frames
+LARGEST_LEAD = 0.95  # of the period: without any rest, where the line is the limit
 FENCE_S = 0.2
+LINE_SHARE = 0.75  # of a frame's time that replies may fill
 NO_TOOL_S = 0.02  # pace of polling while every handle is disabled or unplugged
 BYTES_A_TOOL = {True: 53, False: 94}  # BX, TX, with tool information
 
@@ -36,7 +38,7 @@ class FrameClock:
 
     def __init__(self) -> None:
         self.count = -1  # of the newest frame, unwrapped
-        self._recent: list[tuple[int, float]] = []  # frames: count, host time
+        self._recent: list[tuple[int, float]] = []  # frames: count, host time of asking
         self._step = 0  # smallest difference of frame numbers
         self._lead = 0.25  # how much before the next frame is due the poll goes out, as a share of the period
 
@@ -46,14 +48,14 @@ class FrameClock:
             return frame
         return self.count + (frame - self.count + WRAP // 2) % WRAP - WRAP // 2
 
-    def note(self, count: int, at_s: float, polls: int) -> None:
-        """A new frame came at `at_s` after so many polls."""
+    def note(self, count: int, asked_s: float, polls: int) -> None:
+        """A new frame was there when the device was asked at `asked_s`, after so many polls."""
         change = -0.005 if polls > 1 else 0.005  # met at the first poll: go a little earlier
         if self._step and count - self.count > self._step:
             change = 0.05  # a frame was missed
-        self._lead = min(0.4, max(0.0, self._lead + change))
+        self._lead = min(LARGEST_LEAD, max(0.0, self._lead + change))
         self.count = count
-        self._recent = [*self._recent[-KEPT_FRAMES:], (count, at_s)]
+        self._recent = [*self._recent[-KEPT_FRAMES:], (count, asked_s)]
         self._step = min((b[0] - a[0] for a, b in zip(self._recent, self._recent[1:])), default=0)
 
     @property
@@ -119,6 +121,7 @@ class Poller:
         yield Pause(self.clock.wait_s(self.now()))
         while True:
             try:
+                asked_s = self.now()
                 reply, at_s = yield from self._poll()
                 self.last_good_s, self.trouble, failures = self.now(), "", 0
                 polls += 1
@@ -126,7 +129,7 @@ class Poller:
                     yield Pause(NO_TOOL_S)
                     return reply, at_s
                 if self._is_new(reply):
-                    self.clock.note(self._newest(reply), at_s, polls)
+                    self.clock.note(self._newest(reply), asked_s, polls)
                     self.counts.frames += 1
                     return reply, at_s
                 self.counts.repeats += 1
@@ -140,10 +143,10 @@ class Poller:
 
     def _poll(self) -> Script[tuple[TrackingReply, float]]:
         self.counts.polls += 1
-        command = f"{'BX' if self.binary else 'TX'}:{OPTIONS:04X}"
+        options = self._options()
+        command = f"{'BX' if self.binary else 'TX'}:{options:04X}"
         kind = ReplyKind.BINARY if self.binary else ReplyKind.TEXT
-        length = 20 + BYTES_A_TOOL[self.binary] * len(self.session.tools)
-        timeout_s = max(0.2, 4.0 * 10.0 * length / self.session.speed)
+        timeout_s = max(0.2, 4.0 * self._reply_s())
         try:
             answer: Answer = yield Ask(command, timeout_s, kind)
         except DeviceError as error:
@@ -151,8 +154,16 @@ class Poller:
                 raise
             self.binary = False  # a device without BX
             return (yield from self._poll())
-        reply = parse_bx(answer.data, OPTIONS) if self.binary else parse_tx(answer.data, OPTIONS)
+        reply = parse_bx(answer.data, options) if self.binary else parse_tx(answer.data, options)
         return reply, answer.at_s
+
+    def _reply_s(self) -> float:
+        """How long the line needs for a whole reply."""
+        return 10.0 * (20 + BYTES_A_TOOL[self.binary] * len(self.session.tools)) / self.session.speed
+
+    def _options(self) -> int:
+        """Everything, but on a line too slow for that at the device's rate no tool information."""
+        return OPTIONS if self._reply_s() < LINE_SHARE / self.session.counter_hz else OPTIONS & ~TOOL_INFO
 
     def _newest(self, reply: TrackingReply) -> int:
         counts = [self.clock.unwrap(entry.frame) for entry in reply.handles if entry.frame is not None]

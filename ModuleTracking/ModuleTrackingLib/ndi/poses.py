@@ -43,9 +43,7 @@ def tool_poses(
         if barred and matrix is not None:
             status, matrix = PoseStatus.INVALID, None
         poses.append(
-            ToolPose(
-                tool.name, matrix, status, host_time_s, device_time_s, count, error_mm, tuple(dict.fromkeys(flags + common))
-            )
+            ToolPose(tool.name, matrix, status, host_time_s, device_time_s, count, error_mm, tuple(dict.fromkeys(flags + common)))
         )
     return poses
 

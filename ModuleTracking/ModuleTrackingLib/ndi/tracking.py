@@ -101,16 +101,18 @@ class _Cursor:
         self.at += size
         return values
 
+    def raw(self, size: int) -> bytes:
+        if size > self.left:
+            raise BadReplyError("a binary reply ends inside a field")
+        self.at += size
+        return self.body[self.at - size : self.at]
+
     def byte(self) -> int:
         return int(self.take("<B")[0])
 
     def bits(self, count: int) -> list[bool]:
         """`count` flags from ceil(count / 8) bytes, first marker in the lowest bit of the last byte."""
-        size = -(-count // 8)
-        if size > self.left:
-            raise BadReplyError("a binary reply ends inside a field")
-        value = int.from_bytes(self.body[self.at : self.at + size], "big")
-        self.at += size
+        value = int.from_bytes(self.raw(-(-count // 8)), "big")
         return [bool(value >> index & 1) for index in range(count)]
 
 
@@ -151,8 +153,7 @@ def _bx_handle(cursor: _Cursor, options: int) -> HandleData:
         status, frame = (int(value) for value in cursor.take("<2I"))
     if options & TOOL_INFO:
         info = cursor.byte()
-        packed = bytes(int(value) for value in cursor.take("<10B"))
-        digits = tuple(digit for byte in reversed(packed) for digit in (byte & 15, byte >> 4))
+        digits = tuple(int(digit, 16) for digit in reversed(cursor.raw(10).hex()))
     if options & STRAY_ACTIVE:
         stray_status = cursor.byte()
         if stray_status & 0x01 or (stray_status & 0x08 and options & REPORT_OUT_OF_VOLUME):

@@ -54,6 +54,22 @@ def test_frame_numbers_rise_without_repeats_and_give_the_device_time():
     assert rig.tracker.counts.repeats > 0
 
 
+@pytest.mark.parametrize("rate_hz", [20.0, 60.0, 250.0])
+def test_no_frame_is_left_out_and_few_are_asked_for_twice(rate_hz):
+    rig = Rig(motion=CountingMotion(rate_hz=rate_hz))
+    with rig.tracker:
+        frames = [rig.tracker.read()[0].frame_number for _ in range(300)]
+    assert frames == list(range(frames[0], frames[0] + 300))
+    assert rig.tracker.counts.polls < 2.2 * rig.tracker.counts.frames
+
+
+def test_a_line_too_slow_for_tool_information_goes_without():
+    rig = Rig(baud="115200", motion=CountingMotion(tools=TOOLS[:3], rate_hz=60.0))
+    with rig.tracker:
+        frames = [rig.tracker.read()[0].frame_number for _ in range(200)]
+    assert frames == list(range(frames[0], frames[0] + 200))
+
+
 def test_frame_numbers_go_on_beyond_32_bits():
     rig = Rig(model=Model(first_frame=2**32 - 5))
     with rig.tracker:

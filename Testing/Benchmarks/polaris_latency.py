@@ -1,0 +1,170 @@
+"""Latency, lost frames and processor share of the Polaris driver against the emulator in a process of its own.
+
+    python -m Testing.Benchmarks.polaris_latency --seconds 20
+
+Latency is counted from the moment at which the emulator has written the last byte of a reply to the pseudo-terminal
+until the tool poses leave the driver, and until the tools' transform nodes are written (driver in its own thread,
+scene polled every --poll-ms). The line takes the time that 115200 baud and more need for the bytes. What is lost between
+the driver's first and last frame counts as lost. Both processes share this computer's monotonic clock.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+
+import numpy as np
+from ModuleTrackingLib.ndi.emulator.device import EmulatedPolaris
+from ModuleTrackingLib.ndi.emulator.motion import HandMotion
+from ModuleTrackingLib.ndi.emulator.server import TerminalLine, serve
+from ModuleTrackingLib.ndi.emulator.station import Station
+from ModuleTrackingLib.ndi.poll import OPTIONS
+from ModuleTrackingLib.ndi.replies import BadReplyError
+from ModuleTrackingLib.ndi.tracking import parse_bx
+from ModuleTrackingLib.pose_stream import PoseStream
+from ModuleTrackingLib.tracker import TRACKERS, Tracker
+
+SKIPPED_FRAMES = 100  # the driver learns the device's pace
+
+
+class WatchedLine(TerminalLine):
+    """Notes when each reply has been written; the newest frame's first reply counts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.written: list[tuple[float, bytes]] = []
+
+    def write(self, data: bytes) -> None:
+        super().write(data)
+        self.written.append((time.monotonic(), data))
+
+
+def emulate(rate_hz: float, tell: Connection) -> None:
+    """The emulator's process: its port first, and when it is ended the time of every frame's first reply."""
+    sys.stdin = open(os.devnull)  # noqa: SIM115, PTH123  (no side channel)
+    line = WatchedLine()
+    tell.send(line.url)
+    serve(Station(EmulatedPolaris(HandMotion(rate_hz)), paced=True), line)
+    times: dict[int, float] = {}
+    for at_s, data in line.written:
+        try:
+            frames = [entry.frame for entry in parse_bx(data, OPTIONS).handles if entry.frame is not None]
+        except BadReplyError:
+            continue  # a reply of the set-up
+        if frames:
+            times.setdefault(frames[0], at_s)
+    tell.send((times, time.process_time()))
+
+
+@dataclass
+class Emulator:
+    """The running emulator; `times` and `busy_s` are known once it has ended."""
+
+    url: str
+    times: dict[int, float]
+    busy_s: float = 0.0
+
+
+@contextmanager
+def emulator(rate_hz: float) -> Iterator[Emulator]:
+    """The emulator in a process of its own."""
+    hear, tell = multiprocessing.Pipe(duplex=False)
+    process = multiprocessing.get_context("spawn").Process(target=emulate, args=(rate_hz, tell))
+    process.start()
+    running = Emulator(hear.recv(), {})
+    try:
+        yield running
+    finally:
+        process.terminate()
+        running.times, running.busy_s = hear.recv()
+        process.join()
+
+
+@dataclass(frozen=True)
+class Result:
+    """One line of the table."""
+
+    what: str
+    rate_hz: float
+    frames: int
+    lost: int
+    latency_ms: np.ndarray
+    processor: float  # share of one core
+
+    def __str__(self) -> str:
+        middle, high, worst = np.percentile(self.latency_ms, [50, 99, 100])
+        return (
+            f"{self.what:<28} {self.rate_hz:5.0f} Hz {self.frames:7d} frames {self.lost:4d} lost   "
+            f"median {middle:6.2f} ms   99 % {high:6.2f} ms   worst {worst:7.2f} ms   processor {100 * self.processor:5.1f} %"
+        )
+
+
+def judge(what: str, rate_hz: float, arrivals: dict[int, float], sent: dict[int, float], processor: float) -> Result:
+    """Latencies of the frames that both sides know."""
+    frames = sorted(arrivals)[SKIPPED_FRAMES:]
+    lost = frames[-1] - frames[0] + 1 - len(frames)
+    latency = np.array([arrivals[frame] - sent[frame] for frame in frames if frame in sent])
+    return Result(what, rate_hz, len(frames), lost, 1e3 * latency, processor)
+
+
+def measure_driver(rate_hz: float, seconds: float) -> Result:
+    """From the last byte to the tool poses."""
+    with emulator(rate_hz) as running:
+        arrivals: dict[int, float] = {}
+        with TRACKERS.create("polaris", port=running.url) as tracker:
+            began_s, busy_s = time.monotonic(), time.process_time()
+            while time.monotonic() < began_s + seconds:
+                poses = tracker.read()
+                arrivals[poses[0].frame_number] = time.monotonic()
+            share = (time.process_time() - busy_s) / (time.monotonic() - began_s)
+    return judge("to the tool poses", rate_hz, arrivals, running.times, share)
+
+
+def measure_node(rate_hz: float, seconds: float, poll_ms: float) -> Result:
+    """From the last byte to the transform nodes, as the tracking module writes them."""
+    from CranioNavLib import host, scene_data
+
+    host.scene()
+    with emulator(rate_hz) as running:
+        tracker: Tracker = TRACKERS.create("polaris", port=running.url)
+        arrivals: dict[int, float] = {}
+        with PoseStream(tracker) as stream:
+            while not stream.poll():
+                time.sleep(0.01)
+            began_s, busy_s = time.monotonic(), time.process_time()
+            while time.monotonic() < began_s + seconds:
+                for frame in stream.poll():
+                    for pose in frame:
+                        role = f"{pose.tool}ToReference"
+                        relative = stream.in_reference_at(pose.tool, pose.host_time_s)
+                        if pose.tool != "Reference":
+                            scene_data.set_pose(role, relative.tool_to_reference, relative.status.value, pose.host_time_s)
+                        else:
+                            scene_data.set_transform("ReferenceToTracker", pose.tool_to_tracker)
+                    arrivals[frame[0].frame_number] = time.monotonic()
+                time.sleep(poll_ms / 1e3)
+            share = (time.process_time() - busy_s) / (time.monotonic() - began_s)
+    return judge(f"to the nodes, poll {poll_ms:g} ms", rate_hz, arrivals, running.times, share)
+
+
+def main() -> None:
+    """Print one line a measurement."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--poll-ms", type=float, default=5.0)
+    options = parser.parse_args()
+    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; 4 tools")
+    for rate_hz in (60.0, 250.0):
+        print(measure_driver(rate_hz, options.seconds), flush=True)
+        print(measure_node(rate_hz, options.seconds, options.poll_ms), flush=True)
+
+
+if __name__ == "__main__":
+    main()
