@@ -103,7 +103,12 @@ def pooled(mask: Mask, strides: tuple[int, int, int]) -> Mask:
     """Whether any voxel of each block is set; blocks at the far end may be smaller."""
     for axis, stride in enumerate(strides):
         if stride > 1:
-            mask = np.logical_or.reduceat(mask, np.arange(0, mask.shape[axis], stride), axis=axis)
+            along = np.moveaxis(mask, axis, 0)
+            blocks = along[::stride].copy()
+            for offset in range(1, stride):
+                part = along[offset::stride]
+                blocks[: len(part)] |= part
+            mask = np.moveaxis(blocks, 0, axis)
     return mask
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Optional
 
 import numpy as np
 import numpy.typing as npt
@@ -17,9 +17,9 @@ from ModuleRegistrationLib.anatomy.grid import Floats, Grid, Mask, nearest_voxel
 
 AIR_TISSUE_HU = -300  # above foam cushions (about -650) and hair, below fat (-120)
 COARSE_MM = 2.5
-NECK_MM = 4.0  # what hangs on the head by less than twice this (holder, straps, tubes, ear rims) is cut off
-REGROW_MM = 4.0  # how far the cut is undone along the tissue, so that nose and brow keep their shape
-ORIFICE_MM = 6.0  # nostrils and ear canals up to twice this wide are closed
+NECK_MM = 5.0  # what hangs on the head by less than twice this (holder, straps, tubes, ear rims) is cut off
+REGROW_MM = 5.0  # how far the cut is undone along the tissue, so that nose and brow keep their shape
+ORIFICE_MM = 7.5  # nostrils and ear canals up to twice this wide are closed
 SINUS_MM2 = 4000.0  # an air space within one slice up to this area belongs to the head (a nasal cavity has about 1500)
 SMALLEST_HEAD_ML, LARGEST_HEAD_ML = 150.0, 20000.0  # a slab of a small head; a head with shoulders
 
@@ -68,9 +68,14 @@ def find_head(volume: Volume) -> Head:
     full = Grid.of(volume)
     strides = full.strides(COARSE_MM)
     grid = full.coarser(strides)
+    if not (subsampled(volume.hu, strides) < 2 * AIR_TISSUE_HU).any():
+        raise InputError(
+            f"the CT shows no air: its lowest value is {int(volume.hu.min())} HU; "
+            "it is not in Hounsfield units, or cropped inside the head"
+        )
     tissue = _fill_slices(subsampled(volume.hu, strides) > AIR_TISSUE_HU, grid, SINUS_MM2)
     spacing = grid.spacing_mm
-    core = _largest(signed_distance(tissue, spacing) > NECK_MM)
+    core = _largest(_eroded(tissue, NECK_MM, grid))
     volume_ml = float(core.sum()) * grid.voxel_mm3 / 1000
     if volume_ml < SMALLEST_HEAD_ML:
         raise InputError(
@@ -82,24 +87,24 @@ def find_head(volume: Volume) -> Head:
             f"the CT's tissue is {volume_ml / 1000:.1f} l, more than a head; check the voxel spacing "
             f"({', '.join(f'{s:.2f}' for s in full.spacing_mm[::-1])} mm) and give a CT of the head"
         )
-    body = tissue & (signed_distance(core, spacing) > -(NECK_MM + REGROW_MM))
-    mask = _fill(body, grid)
-    return Head(grid, mask, signed_distance(mask, spacing))
+    mask = _fill(_dilated(core, NECK_MM + REGROW_MM, grid, tissue), grid)
+    half = np.float32(spacing.mean() / 2)  # distances are between the cells' centres, the skin is half way
+    depth = np.where(mask, distance_to(~mask, spacing) - half, half - distance_to(mask, spacing))
+    return Head(grid, mask, depth.astype(np.float32, copy=False))
 
 
-def signed_distance(mask: Mask, spacing_mm: Array) -> npt.NDArray[np.float32]:
-    """Distance (mm) to the mask's edge, positive inside, negative outside. The array's border is no edge.
-
-    Masks that are empty or full have no edge: -inf or +inf everywhere.
-    """
-    if not mask.any() or mask.all():
-        return np.full(mask.shape, np.inf if mask.any() else -np.inf, dtype=np.float32)
+def distance_to(mask: Mask, spacing_mm: Array) -> Floats:
+    """Distance (mm) of each voxel's centre to the nearest voxel of a mask; 0 in it, inf where the mask is empty."""
+    if not mask.any():
+        return np.full(mask.shape, np.inf, dtype=np.float32)
+    if mask.all():
+        return np.zeros(mask.shape, dtype=np.float32)
     sitk: Any = importlib.import_module("SimpleITK")
     image = sitk.GetImageFromArray(mask.view(np.uint8))
     image.SetSpacing([float(s) for s in spacing_mm[::-1]])
-    distance = sitk.SignedMaurerDistanceMap(image, insideIsPositive=True, squaredDistance=False, useImageSpacing=True)
-    result: npt.NDArray[np.float32] = sitk.GetArrayFromImage(distance).astype(np.float32, copy=False)
-    return result
+    distance = sitk.SignedMaurerDistanceMap(image, insideIsPositive=False, squaredDistance=False, useImageSpacing=True)
+    outside: Floats = np.maximum(sitk.GetArrayViewFromImage(distance), np.float32(0)).astype(np.float32, copy=False)
+    return outside
 
 
 def _largest(mask: Mask) -> Mask:
@@ -113,15 +118,31 @@ def _largest(mask: Mask) -> Mask:
     return np.asarray(labels == int(np.argmax(sizes)))
 
 
+def _eroded(mask: Mask, by_mm: float, grid: Grid) -> Mask:
+    """The mask without its outer `by_mm`, in whole cells; the array's border is no edge of it."""
+    from scipy import ndimage
+
+    return np.asarray(ndimage.binary_erosion(mask, iterations=_cells(by_mm, grid), border_value=1), dtype=bool)
+
+
+def _dilated(mask: Mask, by_mm: float, grid: Grid, within: Optional[Mask] = None) -> Mask:
+    """The mask grown by `by_mm`, in whole cells, inside another mask where one is given."""
+    from scipy import ndimage
+
+    return np.asarray(ndimage.binary_dilation(mask, iterations=_cells(by_mm, grid), mask=within), dtype=bool)
+
+
+def _cells(length_mm: float, grid: Grid) -> int:
+    return max(1, round(length_mm / float(grid.spacing_mm.mean())))
+
+
 def _fill(body: Mask, grid: Grid) -> Mask:
     """`body` with orifices closed and cavities filled, those that a clipped end opens included."""
     from scipy import ndimage
 
-    spacing = grid.spacing_mm
-    pad = [(int(np.ceil(2 * ORIFICE_MM / s)),) * 2 for s in spacing]
-    swollen = signed_distance(np.pad(body, pad), spacing) > -ORIFICE_MM
-    closed = signed_distance(swollen, spacing) > ORIFICE_MM
-    inner = tuple(slice(low, -high) for low, high in pad)
+    cells = round(2 * ORIFICE_MM / float(grid.spacing_mm.min()))
+    closed = _eroded(_dilated(np.pad(body, cells), ORIFICE_MM, grid), ORIFICE_MM, grid)
+    inner = (slice(cells, -cells),) * 3
     mask = _fill_slices(body | closed[inner], grid, np.inf)
     return np.asarray(ndimage.binary_fill_holes(mask), dtype=bool)
 

@@ -15,10 +15,10 @@ from ModuleRegistrationLib.anatomy.bone import BoneMesh, BoneVoxels
 from ModuleRegistrationLib.anatomy.grid import Floats, Grid, Mask
 from ModuleRegistrationLib.anatomy.head import Head
 
-REACH_MM = 22.0  # soft tissue over the temple with its muscle is up to 15 mm; some more for a swollen scalp
+REACH_MM = 24.0  # soft tissue over the temple with its muscle is up to 15 mm; some more for a swollen scalp
 FACING_COSINE = 0.5  # 60 deg: a wall steeper to the skin than this gives no echo and is no place to touch
 MARCH_MM = 1.0  # step along the way to the skin; structures thinner than this are below the CT's resolution
-BEYOND_MM, AT_SKIN_MM = 4.0, 1.0  # so far past the skin a place must be at most so deep: a cell of the head is 2.5 mm
+BEYOND_MM, AT_SKIN_MM = 4.0, 2.5  # so far past the skin a place must be at most so deep: a cell of the head is 2.5 mm
 BORDER_MM = 4.0  # nothing is kept this close to where the volume ends: its caps are cuts, not bone
 OPENING_MM = 15.0  # an edge this long or longer is that of an opening; shorter ones are pits of the threshold
 MARGIN_MM = 1.0  # taken off along such edges, where the surface bends inwards

@@ -22,7 +22,7 @@ LOWEST_METAL_HU, HIGHEST_METAL_HU = 1600.0, 2400.0  # dense bone ends below, cli
 METAL_MARGIN_HU = 300.0  # above the densest hundredth of bone
 SMALLEST_SHARE, LARGEST_SHARE = 0.08, 4.0  # of a sphere's volume that a cluster may have: partial volume, blooming
 LARGEST_EXTENT = 2.5  # of the diameter
-WORST_MISFIT = 0.12  # RMS of model minus CT, in units of the metal's contrast, near the sphere
+WORST_MISFIT = 0.17  # RMS of model minus CT, in units of the metal's contrast, near the sphere
 SURROUND_MM = 2.5  # how far beyond the sphere the CT is looked at
 BLUR_MM = 0.5  # the scanner's own blur, beyond the voxel's edge
 MOST_CLUSTERS = 4000  # more clusters than this are noise or a wrong unit, not markers
@@ -80,7 +80,8 @@ def metal_threshold(hu: npt.NDArray[np.int16]) -> float:
 
 def dense_voxels(hu: npt.NDArray[np.int16], threshold: float) -> npt.NDArray[np.int64]:
     """(N, 3) subscripts of the voxels above a threshold that few exceed."""
-    index: npt.NDArray[np.int64] = np.argwhere(hu > threshold)
+    flat = np.flatnonzero(hu.ravel() > threshold)
+    index: npt.NDArray[np.int64] = np.stack(np.unravel_index(flat, hu.shape), axis=1)
     return index
 
 
@@ -144,7 +145,12 @@ def _fit(
 
         bounds = (np.append(center - radius, 0.8 * peak / 1000), np.append(center + radius, 25.0))
         solved = least_squares(
-            misfit, np.append(center, np.clip(level / 1000, 0.81 * peak / 1000, 24)), bounds=bounds, x_scale=(1, 1, 1, 2)
+            misfit,
+            np.append(center, np.clip(level / 1000, 0.81 * peak / 1000, 24)),
+            bounds=bounds,
+            xtol=1e-4,
+            ftol=1e-6,
+            x_scale=(1, 1, 1, 2),
         )
         center, level, residual = solved.x[:3], solved.x[3] * 1000, solved.fun
     contrast = peak - float(np.median(behind))

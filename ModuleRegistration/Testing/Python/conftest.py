@@ -31,11 +31,19 @@ def a_sample_head() -> Volume:
 @pytest.fixture(scope="session")
 def a_shell() -> Callable[..., Volume]:
     """Voxelised concentric spheres: scalp, outer table, diploe, inner table, brain. Truth by super-sampling."""
-    return _shell
+    kept: dict[str, Volume] = {}
+
+    def shell(*arguments: Any, **options: Any) -> Volume:
+        key = repr((arguments, options))
+        if key not in kept:
+            kept[key] = _shell(*arguments, **options)
+        return kept[key]
+
+    return shell
 
 
 def _shell(
-    radius_mm: float = 45.0,
+    radius_mm: float = 40.0,
     spacing_mm: tuple[float, float, float] = (2.0, 0.42, 0.42),
     layers: tuple[tuple[float, float], ...] = ((1.5, 1400.0), (3.0, 600.0), (1.5, 1400.0)),
     scalp_mm: float = 6.0,
