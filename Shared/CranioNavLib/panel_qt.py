@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from CranioNavLib import host, scene
+from CranioNavLib.errors import InputError
 from CranioNavLib.panel import (
     Action,
     FileField,
@@ -265,12 +266,13 @@ def _style(level: Level, large: bool) -> str:
 
 
 def show_in(widget: Any, model: PanelModel) -> PanelWidget:
-    """The panel in a ScriptedLoadableModuleWidget's own layout, with the module's packages looked after.
+    """The panel in a ScriptedLoadableModuleWidget's own layout, once the user was asked about missing packages.
 
-    Raises
-    ------
-    InputError
-        Packages are missing, and the user does not want them installed.
+    Without them the panel is drawn all the same; an action that needs one says so.
     """
-    host.install_missing_packages()
+    if host.in_application():
+        try:
+            host.install_missing_packages()
+        except InputError as error:
+            host.slicer_package().util.errorDisplay(str(error), windowTitle="CranioNav")
     return PanelWidget(model, widget.layout)

@@ -146,3 +146,37 @@ def test_inside_the_application_packages_are_installed_only_when_the_user_agrees
             host.install_missing_packages()
         assert util.installed == []
     assert "no-such-thing" in util.asked
+
+
+def test_inside_the_application_its_scene_and_base_classes_are_used(monkeypatch):
+    import types
+
+    import slicer
+
+    theirs = types.ModuleType("slicer.ScriptedLoadableModule")
+    for name in host.BASE_CLASSES:
+        setattr(theirs, name, type(name, (), {}))
+    their_scene = object()
+    monkeypatch.setattr(slicer, "app", object(), raising=False)
+    monkeypatch.setattr(slicer, "mrmlScene", their_scene)
+    monkeypatch.setitem(sys.modules, "slicer.ScriptedLoadableModule", theirs)
+    assert host.scene() is their_scene
+    assert host.slicer.mrmlScene is their_scene
+    for name in host.BASE_CLASSES:
+        assert getattr(host, name) is getattr(theirs, name)
+
+
+def test_a_module_works_in_a_plain_console_as_in_slicers():
+    done = run(
+        "import ModuleRegistration\n"
+        "from ModuleRegistration import ModuleRegistrationLogic\n"
+        "logic = ModuleRegistrationLogic()\n"
+        "import slicer\n"
+        "assert logic.getParameterNode().GetScene() is slicer.mrmlScene\n"
+        "assert logic.getParameterNode() is ModuleRegistrationLogic().getParameterNode()\n"
+        "module = ModuleRegistration.ModuleRegistration(None)\n"
+        "import pathlib\n"
+        "assert pathlib.Path(module.resourcePath('Icons/ModuleRegistration.png')).is_file()\n"
+        "assert 'Landmarks' in module.parent.helpText\n"
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
