@@ -4,7 +4,21 @@ from __future__ import annotations
 
 import typer
 
-from Workstation.commands import batch, demo, echo, evaluate, markers, plausibility, plugins, register, selftest, surface, tracker
+from Workstation.commands import (
+    batch,
+    demo,
+    echo,
+    emulate,
+    evaluate,
+    markers,
+    plausibility,
+    plugins,
+    register,
+    selftest,
+    study,
+    surface,
+    tracker,
+)
 from Workstation.commands import test as suite
 
 app = typer.Typer(
@@ -22,7 +36,9 @@ app.command("register")(register.register)
 app.command("batch")(batch.batch)
 app.command("evaluate")(evaluate.evaluate)
 app.command("plausibility")(plausibility.plausibility)
+app.command("study")(study.study)
 app.command("echo")(echo.echo)
+app.add_typer(emulate.app, name="emulate")
 app.add_typer(tracker.app, name="tracker")
 app.command("selftest")(selftest.selftest)
 app.command("plugins")(plugins.plugins)

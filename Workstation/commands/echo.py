@@ -20,7 +20,8 @@ def echo(
     from collections import Counter
 
     from CranioNavLib.sequence_metafile import read_recording
-    from ModuleUltrasoundLib.measure import EchoSettings, measure_lines, write_depths_csv
+    from ModuleUltrasoundLib.measure import EchoSettings, measure_lines
+    from ModuleUltrasoundLib.measure_table import write_depths_csv
 
     from Workstation.terminal import print_json, progress_bar
 

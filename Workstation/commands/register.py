@@ -14,6 +14,7 @@ def register(
     method: Annotated[Optional[str], typer.Option(help="registration plugin; see `cranionav plugins`")] = None,
     mode: Annotated[Optional[str], typer.Option(help="Ia, Ib, IIa, IIb or III; default: the richest the case allows")] = None,
     segmentation: Annotated[str, typer.Option(help="segmentation plugin")] = "threshold",
+    load: Annotated[Optional[list[Path]], typer.Option(metavar="FILE", help="a Python file that registers plugins")] = None,
     json: Annotated[bool, typer.Option("--json", help="print registration.json on stdout")] = False,
 ) -> int:
     """Register a case; write the transform, registration.json, scene.mrb and report.html.
@@ -22,11 +23,14 @@ def register(
     """
     from CranioNavLib.case import read_case
     from CranioNavLib.files import output_folder
+    from CranioNavLib.plugins import load_file
     from ModuleRegistrationLib.procedure import register_case
 
     from Workstation.outputs import write_outputs
     from Workstation.terminal import print_json, progress_bar
 
+    for file in load or []:
+        load_file(file)
     folder = output_folder(output)
     with progress_bar() as say:
         result = register_case(read_case(case), mode, method, segmentation, progress=lambda step, share: say(step, 0.7 * share))
