@@ -19,6 +19,7 @@ from CranioNavLib.surface import Surface
 from CranioNavLib.volume import Volume
 
 AIR_HU = -1024
+SHAVED_MM = 2.0  # thin shells (head holder) that touch the head come loose when this much is shaved off
 SMALLEST_HEAD_MM3 = 5e5  # half a litre: less is no head
 
 
@@ -41,8 +42,9 @@ def extract_head(volume: Volume) -> HeadSurfaces:
     """
     mask = head_region(volume)
     hu = volume.hu.astype(np.float32)
-    near = np.where(_grow(mask, 2), hu, AIR_HU)  # the skin runs through the voxels beside the mask
-    inside = mask & ~_grow(~mask, 2)  # cells of air in here are airways, not the world outside
+    voxels = _voxels(SHAVED_MM, volume)
+    near = np.where(_grow(mask, voxels), hu, AIR_HU)  # the skin runs through the voxels beside the mask
+    inside = mask & ~_grow(~mask, voxels)  # cells of air in here are airways, not the world outside
     skin = _iso_surface(np.where(inside, np.maximum(near, 0.0), near), volume, constants.TRUE_SKIN_HU)
     bone = _iso_surface(np.where(mask, hu, AIR_HU), volume, constants.TRUE_BONE_HU)
     return HeadSurfaces(bone, skin, mask)
@@ -54,13 +56,13 @@ def head_region(volume: Volume) -> npt.NDArray[np.bool_]:
 
     spacing = np.linalg.norm(volume.ijk_to_ras[:3, :3], axis=0)
     tissue = volume.hu > constants.TRUE_SKIN_HU
-    # Thin shells (head holder) that touch the head come loose when 3 mm are shaved off; the body is grown back.
-    core = ndimage.binary_erosion(tissue, iterations=2)
+    voxels = _voxels(SHAVED_MM, volume)
+    core = ndimage.binary_erosion(tissue, iterations=voxels)
     labels, count = ndimage.label(core)
     if count == 0:
         raise InputError("the CT holds no body: nothing in it is denser than air; give a CT of a head in HU")
     sizes = np.bincount(labels.ravel())[1:]
-    body = ndimage.binary_dilation(labels == 1 + int(np.argmax(sizes)), iterations=3) & tissue
+    body = ndimage.binary_dilation(labels == 1 + int(np.argmax(sizes)), iterations=voxels + 1) & tissue
     if body.sum() * float(np.prod(spacing)) < SMALLEST_HEAD_MM3:
         raise InputError("the CT holds no head: its largest body is smaller than half a litre; give a CT of a whole head")
     radius = max(1, round(constants.NOSE_AND_EAR_SEAL_MM / 2 / float(spacing[0])))
@@ -82,6 +84,10 @@ def _sealed(section: npt.NDArray[np.bool_], radius: int) -> npt.NDArray[np.bool_
     inner = slice(2 * radius + 1, -2 * radius - 1)
     filled: npt.NDArray[np.bool_] = (outside != outside[0, 0])[inner, inner]
     return filled
+
+
+def _voxels(length_mm: float, volume: Volume) -> int:
+    return max(1, round(length_mm / float(np.linalg.norm(volume.ijk_to_ras[:3, :3], axis=0).min())))
 
 
 def _grow(mask: npt.NDArray[np.bool_], voxels: int) -> npt.NDArray[np.bool_]:

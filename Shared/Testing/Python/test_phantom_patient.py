@@ -79,6 +79,8 @@ def test_landmarks_of_the_sample_head_lie_on_the_bone_where_anatomy_has_them(the
     assert patient.bone.closest(patient.landmarks_ras_mm).distances_mm.max() < 0.01
     nasion, left, right, spine = patient.landmarks_ras_mm
     assert patient.landmark_labels == LANDMARK_LABELS
+    holder = np.linalg.norm(patient.skin.vertices_mm[:, :2], axis=1)  # it stands about 117 mm from the middle
+    assert holder[patient.skin.vertices_mm[:, 1] < 0].max() < 114
     assert left[0] < -40
     assert right[0] > 40  # RAS: x grows to the right
     assert abs(left[2] - right[2]) < 4
