@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Optional
@@ -149,7 +150,14 @@ def collect_points(case: Case, mode: str) -> tuple[BonePoints, Optional[Ultrasou
     assert case.palpation is not None
     recording = read_recording(case.palpation)
     measurements = measure_lines(recording)
-    return bone_points(recording, measurements), Ultrasound(recording, measurements)
+    points = bone_points(recording, measurements)
+    if not len(points):
+        most = Counter(reason for reason in measurements.reasons if reason).most_common(3)
+        statuses = Counter(status for status in recording.statuses if status != "OK").most_common(2)
+        why = ", ".join(f"{count} times {reason}" for reason, count in most)
+        lost = "".join(f", {count} frames {status}" for status, count in statuses)
+        raise InputError(f"{case.palpation}: none of {len(recording)} lines shows bone ({why}{lost}); palpate again")
+    return points, Ultrasound(recording, measurements)
 
 
 def _method_for(mode: str, wanted: Optional[str]) -> str:
