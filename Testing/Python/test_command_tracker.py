@@ -1,0 +1,167 @@
+"""`cranionav tracker`: list, probe, record and recover, as a user calls them."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK
+from CranioNavLib.rigid import rigid
+from CranioNavLib.sequence_metafile import journal_of, read_recording
+from ModuleTrackingLib.pose_csv import PoseCsvWriter, read_pose_csv
+from ModuleTrackingLib.tracker import PoseStatus, ToolPose
+from scipy.spatial.transform import Rotation
+
+from Workstation.__main__ import run
+
+
+def base_at(time_s: float) -> np.ndarray:
+    return rigid(Rotation.from_rotvec([0, 0.1 * time_s, 0]).as_matrix(), [10 * time_s, 0, -1500])
+
+
+PROBE_TO_REFERENCE = rigid(Rotation.from_rotvec([0.3, 0.2, 0.1]).as_matrix(), [40, -20, 90])
+
+
+@pytest.fixture
+def a_table(tmp_path):
+    """Two seconds of a probe, a base that moves, and a stylus that is never seen."""
+    with PoseCsvWriter(tmp_path / "in.csv") as writer:
+        for k in range(120):
+            base = base_at(k / 60)
+            poses = [
+                ToolPose("Probe", base @ PROBE_TO_REFERENCE, PoseStatus.OK, 0, error_mm=0.2),
+                ToolPose("Reference", base, PoseStatus.OK, 0, error_mm=0.1),
+                ToolPose("Stylus", None, PoseStatus.MISSING, 0),
+            ]
+            writer.write(k / 60, poses)
+    return tmp_path / "in.csv"
+
+
+def cranionav(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "Workstation", *map(str, arguments)]
+
+
+def refused(capsys, *arguments: object) -> str:
+    assert run([str(argument) for argument in arguments]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+def test_list_names_trackers_and_their_parameters(capsys):
+    assert run(["tracker", "list"]) == 0
+    said = capsys.readouterr().out
+    assert all(name in said for name in ("openigtlink", "polaris", "replay", "simulated"))
+    assert "port=18944" in said
+    assert run(["tracker", "list", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    replay = next(tracker for tracker in listed["trackers"] if tracker["name"] == "replay")
+    assert {parameter["name"] for parameter in replay["parameters"]} == {"path", "speed", "loop"}
+
+
+def test_probe_tells_what_is_seen(capsys, a_table):
+    assert run(["tracker", "probe", "replay", "-s", f"path={a_table}", "--seconds", "1", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    tools = {tool["tool"]: tool for tool in report["tools"]}
+    assert tools["Probe"]["status"] == "OK"
+    assert tools["Probe"]["error_mm"] == pytest.approx(0.2)
+    assert tools["Probe"]["seen"] == 1
+    assert (tools["Stylus"]["status"], tools["Stylus"]["position_mm"], tools["Stylus"]["seen"]) == ("MISSING", None, 0)
+    assert report["dropped_frames"] == 0
+    assert report["frames"] > 10
+    assert run(["tracker", "probe", "replay", "-s", f"path={a_table}", "--seconds", "0.3"]) == 0
+    assert re.search(r"Stylus\W+MISSING", capsys.readouterr().out)
+
+
+def test_record_writes_recording_and_table(capsys, a_table, tmp_path):
+    arguments = ["tracker", "record", "replay", "-s", f"path={a_table}", "--seconds", "1", "--json"]
+    assert run([*arguments, "-o", str(tmp_path / "out.igs.mha"), "--csv", str(tmp_path / "out.csv")]) == 0
+    report = json.loads(capsys.readouterr().out)
+    recording = read_recording(tmp_path / "out.igs.mha")
+    assert len(recording) == report["frames"] > 20
+    # The base moves all the time; in Reference the probe does not.
+    good = np.array([status == "OK" for status in recording.statuses])
+    assert good.mean() > 0.9
+    expected = np.broadcast_to(PROBE_TO_REFERENCE, recording.probe_to_reference[good].shape)
+    np.testing.assert_allclose(recording.probe_to_reference[good], expected, atol=1e-5)
+    table = read_pose_csv(tmp_path / "out.csv")
+    assert len(table) >= report["frames"] - 2
+    assert {row.tool for row in table[0]} == {"Probe", "Reference", "Stylus"}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.csv", "out.csv", "out.igs.mha"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT and SIGKILL")
+@pytest.mark.parametrize("kill", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda number: number.name)
+def test_an_ended_recording_is_whole_and_a_killed_one_is_recovered(capsys, a_table, tmp_path, kill):
+    target = tmp_path / "out.igs.mha"
+    command = cranionav("tracker", "record", "replay", "-s", f"path={a_table}", "-o", target, "--json")
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    journal = journal_of(target)
+    deadline = time.monotonic() + 60
+    while not journal.exists() or journal.read_bytes().count(b"_Timestamp") < 40:
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(kill)
+    out, err = process.communicate(timeout=30)
+    if kill is signal.SIGKILL:
+        assert not target.exists()
+        assert "recover it" in refused(capsys, "tracker", "probe", "replay", "-s", f"path={target}")
+        assert run(["tracker", "recover", str(target)]) == 0
+    else:
+        assert process.returncode == 0, err
+        assert json.loads(out)["frames"] >= 40
+    assert len(read_recording(target)) >= 40
+    assert not journal.exists()
+    reader = SimpleITK.ImageFileReader()
+    reader.SetFileName(str(target))
+    assert Path(target).read_bytes().startswith(b"ObjectType = Image\nNDims = 3\n")
+
+
+def test_a_lines_are_recorded_with_their_poses(capsys, a_table, tmp_path):
+    target = tmp_path / "lines.igs.mha"
+    arguments = ["tracker", "record", "replay", "-s", f"path={a_table}", "--amode", "simulated", "--amode-set", "head=synthetic"]
+    status = run([*arguments, "--seconds", "1.5", "-o", str(target), "--json"])
+    captured = capsys.readouterr()
+    assert status == 0, captured.err
+    recording = read_recording(target)
+    assert len(recording) == json.loads(captured.out)["frames"]
+    assert recording.lines.shape[1] > 100
+    good = np.array([status == "OK" for status in recording.statuses])
+    assert good.mean() > 0.5  # not all: on a busy computer the poses have gaps
+    expected = np.broadcast_to(PROBE_TO_REFERENCE, recording.probe_to_reference[good].shape)
+    np.testing.assert_allclose(recording.probe_to_reference[good], expected, atol=0.01)
+    image = SimpleITK.ReadImage(str(target))
+    np.testing.assert_array_equal(SimpleITK.GetArrayFromImage(image)[:, 0], recording.lines)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["probe", "nothing"], "nothing"),
+        (["probe", "replay"], "no recording given"),
+        (["probe", "replay", "-s", "path=none.csv"], "none.csv: cannot be read"),
+        (["probe", "replay", "-s", "path"], "expected PARAMETER=VALUE, got 'path'"),
+        (["probe", "replay", "-s", "pace=2"], "unknown parameter 'pace'"),
+        (
+            ["probe", "openigtlink", "-s", "port=1", "-s", "connect_timeout_s=0.3", "--timeout", "1"],
+            "no connection in 1 s: OpenIGTLink: 127.0.0.1:1: connection refused",
+        ),
+        (["record", "replay", "-s", "path=none.csv"], "nothing to record to"),
+        (["record", "replay", "-s", "path={table}", "--csv", "{tmp}/none/a.csv", "--seconds", "1"], "choose a folder"),
+        (["record", "replay", "-s", "path={table}", "-o", "{tmp}/a.nrrd", "--seconds", "1"], "written as .igs.mha"),
+        (["record", "replay", "-s", "path={table}", "--csv", "{tmp}/a.csv", "--amode", "simulated"], "give -o FILE.igs.mha"),
+        (["recover", "{tmp}/a.igs.mha"], "nothing to recover"),
+    ],
+)
+def test_bad_calls_end_with_one_line_and_status_2(capsys, a_table, tmp_path, arguments, message):
+    filled = (argument.replace("{table}", str(a_table)).replace("{tmp}", str(tmp_path)) for argument in arguments)
+    assert message in refused(capsys, "tracker", *filled)
