@@ -10,6 +10,7 @@ import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.sample_head import load_sample_head
 from ModuleRegistrationLib.verification.studies import TrialRow, run_seed, run_study, summarise, write_table
+from ModuleRegistrationLib.verification.study_figure import write_figure
 
 
 @pytest.fixture(scope="module")
@@ -138,3 +139,16 @@ def test_a_table_reads_back_with_empty_cells_for_what_is_not_known(tmp_path):
     assert second["message"] == "a, b"
     with pytest.raises(InputError, match="no rows to write"):
         write_table(tmp_path / "none.csv", [])
+
+
+def test_a_figure_is_drawn_of_one_study_and_refused_for_several(tmp_path):
+    rows = [a_row(seed=seed, mode=mode, tre_mean_mm=1.0 + 0.1 * seed) for seed in range(5) for mode in ("IIa", "III")]
+    rows.append(a_row(seed=9, status="failed", tre_mean_mm=math.nan))
+    write_figure(tmp_path / "study.svg", rows)
+    text = (tmp_path / "study.svg").read_text()
+    assert "1 failed" in text
+    assert "Simulated phantom study" in text
+    for wrong in ([], [a_row(), a_row(study="cadaver")]):
+        with pytest.raises(InputError, match="a figure shows one study"):
+            write_figure(tmp_path / "wrong.png", wrong)
+    assert not (tmp_path / "wrong.png").exists()

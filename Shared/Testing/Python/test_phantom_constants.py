@@ -14,7 +14,7 @@ MAY_USE_THE_PHANTOM = {
     "ModuleUltrasound/ModuleUltrasoundLib/plugins/simulated.py",
     "ModuleUltrasound/ModuleUltrasoundLib/emulators/line_source.py",
     "ModuleRegistration/ModuleRegistrationLib/verification/studies.py",
-    "ModuleRegistration/ModuleRegistrationLib/verification/study_trials.py",
+    "ModuleRegistration/ModuleRegistrationLib/verification/study_figure.py",
 }
 LIB_FILES = sorted(path for lib in ROOT.glob("Module*/Module*Lib") for path in lib.rglob("*.py"))
 LIB_FILES += sorted(path for path in (ROOT / "Shared/CranioNavLib").glob("*.py"))

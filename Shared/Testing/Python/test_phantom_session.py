@@ -158,8 +158,8 @@ def test_a_path_begins_and_ends_where_it_should_without_a_jerk():
     assert np.allclose(path.at(9.0), np.eye(4))
     assert np.allclose(path.at(12.5), goal)
     assert path.at(11.0)[:3, 3] == pytest.approx((50.0, 0.0, 40.0))
-    places = np.array([path.at(t)[:3, 3] for t in np.arange(10, 12, 0.001)])
-    assert np.abs(np.diff(places, axis=0)).max() < 0.2  # below 200 mm/s everywhere
+    places = np.array([path.at(t)[:3, 3] for t in np.arange(10, 12, 0.01)])
+    assert np.abs(np.diff(places, axis=0)).max() < 2.0  # below 200 mm/s everywhere
 
 
 def test_tremor_over_time_has_unit_size():
