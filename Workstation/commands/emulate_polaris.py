@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
-
-import typer
 
 
 def run(
@@ -59,38 +56,3 @@ def run(
         serve(Station(device, paced), line, keep_state)
     finally:
         line.close()
-
-
-def polaris(
-    replay: Annotated[
-        Optional[Path], typer.Option(metavar="POSES.csv", help="poses to play in a loop; else four tools move")
-    ] = None,
-    fault: Annotated[
-        Optional[list[str]],
-        typer.Option(metavar="NAME", help="what goes wrong: NAME, NAME=SHARE, NAME=SECONDS:SECONDS; repeatable"),
-    ] = None,
-    tcp: Annotated[bool, typer.Option("--tcp", help="serve a TCP port on this computer instead of a pseudo-terminal")] = False,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="the TCP port; 0: any free one")] = 0,
-    rate: Annotated[float, typer.Option(min=1, max=1000, help="frames a second, without --replay")] = 60.0,
-    seed: Annotated[int, typer.Option(help="of the faults")] = 0,
-    link: Annotated[Optional[Path], typer.Option(help="a link with this name to the pseudo-terminal")] = None,
-    keep_state: Annotated[bool, typer.Option("--keep-state", help="closing the port does not reset the device")] = False,
-    paced: Annotated[bool, typer.Option("--paced", help="replies take as long as a real line needs")] = False,
-    text_only: Annotated[bool, typer.Option("--text-only", help="a device without binary replies")] = False,
-) -> None:
-    """A stand-in for an NDI Polaris. Prints its port, then serves it until interrupted.
-
-    While it runs, lines on standard input change it: fault NAME, clear [NAME], reset, unplug SECONDS.
-    """
-    run(
-        replay,
-        fault,
-        tcp or port > 0,
-        port=port,
-        rate_hz=rate,
-        seed=seed,
-        link=link,
-        keep_state=keep_state,
-        paced=paced,
-        text_only=text_only,
-    )

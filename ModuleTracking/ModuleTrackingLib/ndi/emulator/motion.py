@@ -34,6 +34,8 @@ class HandMotion:
     """
 
     def __init__(self, rate_hz: float = 60.0, tools: tuple[str, ...] = ("Reference", "Probe", "Stylus", "Sphere")) -> None:
+        if not 1.0 <= rate_hz <= 1000.0:
+            raise InputError(f"a tracker has 1 to 1000 frames a second, got {rate_hz:g}")
         self.tools, self.rate_hz = tools, rate_hz
 
     def sample(self, time_s: float) -> tuple[int, dict[str, Optional[RawPose]]]:
