@@ -33,21 +33,27 @@ def record(
     contact = np.ones(count, dtype=bool) if contact is None else contact
     bone = np.ones(count, dtype=bool) if bone is None else bone
     lines = np.zeros((count, samples))
+    def add(line, at_s, height):
+        first, last = (int((at_s + edge) * acquisition.sampling_hz) for edge in (-3 / centre, 12 / centre))
+        first, last = max(first, 0), min(last, samples)
+        if first < last:
+            line[first:last] += height * wave(time[first:last] - at_s, centre)
+
     for index, depth in enumerate(depths_mm):
         line = lines[index]
         if skin:
             face = -0.2 if contact[index] else -1.0
             for bounce in (1, 2, 3):
-                line += face**bounce * 0.4 ** (bounce - 1) * wave(time - bounce * skin, centre)
+                add(line, bounce * skin, face**bounce * 0.4 ** (bounce - 1))
         if contact[index]:
             arrival = skin + 2e-3 * depth / SPEED
             reach = depth if bone[index] else 40.0
             for z, amount in zip(rng.uniform(0.5, reach, int(reach * 6)), rng.normal(0, 0.004, int(reach * 6))):
-                line += amount * wave(time - skin - 2e-3 * z / SPEED, centre)
-            line += galea * wave(time - skin - 2e-3 * 0.55 * depth / SPEED, centre)
+                add(line, skin + 2e-3 * z / SPEED, amount)
+            add(line, skin + 2e-3 * 0.55 * depth / SPEED, galea)
             if bone[index]:
-                line += 0.5 * wave(time - arrival, centre)
-                line -= 0.12 * wave(time - arrival - 2e-3 * 5.5 / 3000, centre)
+                add(line, arrival, 0.5)
+                add(line, arrival + 2e-3 * 5.5 / 3000, -0.12)
         line += rng.normal(0, 0.5 * 10 ** (-snr_db / 20), samples)
     points = np.arange(count) if points is None else points
     places = rng.uniform(-60, 60, (points.max() + 1, 3))[points]
