@@ -123,6 +123,7 @@ AIM_SD_MM = 3.0  # [M] how far from the planned point the user comes down, along
 COMPRESSION_RANGE = (0.05, 0.25)  # [M] share of the thickness taken away by contact pressure
 TREMOR_HZ = 8.0  # [M] physiological tremor 8-12 Hz, with slower sway
 DWELL_LINES = 40  # [M] lines recorded at a palpation point (1 s)
+SWEEP_TILT_SD_DEG = 4.0  # [M] per axis, of a probe that slides over the head without guidance
 MISSING_FRAME_SHARE = 0.03  # [M] frames in which the camera loses the probe
 STYLUS_TIP_MM = (1.2, -0.7, 118.6)  # [M] of the simulated stylus in its marker frame: what pivot calibration has to find
 SPHERE_TIP_MM = (-0.4, 0.9, 131.2)  # [M] of the tool with the sphere

@@ -89,10 +89,47 @@ def stand_at(
         Rotation.from_rotvec(np.column_stack([tilts, np.zeros(len(tilts))])).as_matrix(), np.zeros(3)
     )
     beams = tilted[:, :3, 2]
-    reach = patient.skin.cast(points - 0.05 * beams, -beams).distances_mm + 0.05
+    return Stand(points, beams, pressed_tissue(patient, points, beams, rng.uniform(*constants.COMPRESSION_RANGE, len(beams))))
+
+
+def pressed_tissue(patient: VirtualPatient, bone_points_mm: Array, beams: Array, compression: Array) -> Array:
+    """(N,) scalp along the beams from the skin to bone points, with a share (N,) of it pressed away."""
+    reach = patient.skin.cast(bone_points_mm - 0.05 * beams, -beams).distances_mm + 0.05
     reach = np.where(np.isfinite(reach), reach, THINNEST_SCALP_MM)
-    pressed = reach * (1 - rng.uniform(*constants.COMPRESSION_RANGE, len(reach)))
-    return Stand(points, beams, np.maximum(pressed, THINNEST_SCALP_MM))
+    return np.asarray(np.maximum(reach * (1 - compression), THINNEST_SCALP_MM))
+
+
+def slide_over(
+    patient: VirtualPatient,
+    positions_ras_mm: npt.ArrayLike,
+    outward: npt.ArrayLike,
+    lines: int,
+    rng: np.random.Generator,
+    tilt_sd_deg: float = constants.SWEEP_TILT_SD_DEG,
+) -> Array:
+    """True ProbeToRas (lines, 4, 4) while the probe slides over the skin from one planned place to the next.
+
+    Nobody steers it to the bone's normal here: it stands roughly upright on the head, tilted by `tilt_sd_deg` an axis.
+    """
+    from scipy.special import ndtr
+
+    positions, normals = check_points(positions_ras_mm, at_least=2), np.asarray(outward, dtype=float)
+    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
+    along = np.linspace(0.0, lengths[-1], lines)
+    chord = np.column_stack([np.interp(along, lengths, positions[:, axis]) for axis in range(3)])
+    upright = np.column_stack([np.interp(along, lengths, normals[:, axis]) for axis in range(3)])
+    upright /= np.linalg.norm(upright, axis=1, keepdims=True)
+    points = bone_below(patient, chord, upright)[0]
+    points = np.where(np.isfinite(points), points, chord)  # over a hole the hand goes on
+    sway = tremor(rng, 1, lines, 3)[0]
+    tilts = np.column_stack([np.radians(tilt_sd_deg) * sway[:, :2], np.zeros(lines)])
+    frames = frames_along(-upright, points) @ rigid(Rotation.from_rotvec(tilts).as_matrix(), np.zeros(3))
+    low, high = constants.COMPRESSION_RANGE
+    tissue = pressed_tissue(patient, points, frames[:, :3, 2], low + (high - low) * ndtr(sway[:, 2]))
+    depth = np.zeros((lines, 3))
+    depth[:, 2] = -(tissue + constants.FORERUN_LENGTH_MM)
+    poses: Array = frames @ rigid(np.eye(3), depth)
+    return poses
 
 
 def hold(stand: Stand, lines: int, rng: np.random.Generator, skill: Optional[Skill] = None) -> Array:

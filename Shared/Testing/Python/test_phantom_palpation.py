@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from CranioNavLib.phantom import constants, make_patient, palpate
+from CranioNavLib.phantom import constants, make_patient, palpate, sweep
 from CranioNavLib.phantom.beam import look_at_bone
 from CranioNavLib.phantom.hand import Skill, bone_below, hold, stand_at, tremor
 from CranioNavLib.phantom.sites import outer_seats
@@ -90,3 +90,20 @@ def test_a_palpation_is_a_whole_recording_with_lost_frames(a_patient, places):
     assert 0.1 < np.sqrt((error**2).sum(axis=1).mean()) < 1.5
     again = palpate(a_patient, places[0][:6], places[1][:6], np.random.default_rng(5), lines_per_point=50, missing_share=0.1)
     assert np.array_equal(again.recording.lines, recording.lines)
+
+
+def test_a_sweep_slides_over_the_head_without_jumps_and_names_no_points(a_patient, places):
+    by_height = np.argsort(places[0][:, 2])[-6:]
+    made = sweep(a_patient, places[0][by_height], places[1][by_height], np.random.default_rng(6), lines=400)
+    recording = made.recording
+    assert recording.lines.shape == (400, constants.LINE_SAMPLES)
+    assert set(recording.palpation_points) == {-1}
+    assert np.diff(recording.timestamps_s) == pytest.approx(np.full(399, 1 / constants.LINE_RATE_HZ))
+    poses = a_patient.true_reference_to_ras @ made.true_probe_to_reference
+    frames = contact_frames(a_patient, poses)
+    length = np.linalg.norm(np.diff(places[0][by_height], axis=0), axis=1).sum()
+    # the contact tilts with the hand: a few millimetres a line beyond the even way along the plan
+    assert np.linalg.norm(np.diff(frames[:, :3, 3], axis=0), axis=1).max() < 3 * length / 400 + 2.0
+    assert a_patient.skin.signed_distance(frames[:, :3, 3]).max() < 0.3
+    tilt = look_at_bone(a_patient.bone, frames).tilt_deg
+    assert 2.0 < np.nanmedian(tilt) < 12.0
