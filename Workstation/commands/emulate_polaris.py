@@ -11,6 +11,7 @@ def run(
     tcp: bool = False,
     *,
     port: int = 0,
+    patient: bool = False,
     rate_hz: float = 60.0,
     seed: int = 0,
     link: Path | None = None,
@@ -29,6 +30,8 @@ def run(
         standard input change them: `fault NAME`, `clear`, `reset`, `unplug SECONDS`; SIGUSR1 resets too.
     tcp, port : bool, int
         Serve 127.0.0.1 instead of a pseudo-terminal; port 0 takes a free one.
+    patient : bool
+        Without a pose CSV: the tools of a simulated session on the virtual patient (the sample head).
     link : Path, optional
         A symbolic link with a name of its own that points to the pseudo-terminal.
     keep_state : bool
@@ -44,12 +47,17 @@ def run(
         A pose file or a fault that cannot be used, or no pseudo-terminals on this system.
     """
     from ModuleTrackingLib.ndi.emulator.device import EmulatedPolaris, Model
-    from ModuleTrackingLib.ndi.emulator.motion import HandMotion, ReplayedMotion
+    from ModuleTrackingLib.ndi.emulator.motion import HandMotion, Motion, ReplayedMotion
     from ModuleTrackingLib.ndi.emulator.server import open_line, serve
     from ModuleTrackingLib.ndi.emulator.station import Station, make_faults
 
-    motion = ReplayedMotion(replay) if replay is not None else HandMotion(rate_hz)
-    device = EmulatedPolaris(motion, make_faults(faults or [], seed), Model(has_bx=not text_only))
+    found = make_faults(faults or [], seed)
+    motion: Motion = ReplayedMotion(replay) if replay is not None else HandMotion(rate_hz)
+    if patient and replay is None:
+        from ModuleTrackingLib.ndi.emulator.patient import patient_motion
+
+        motion = patient_motion(seed, rate_hz)
+    device = EmulatedPolaris(motion, found, Model(has_bx=not text_only))
     line = open_line(tcp, port, link)
     try:
         print(line.url, flush=True)
