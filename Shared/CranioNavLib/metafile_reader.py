@@ -211,7 +211,7 @@ def _read_pixels(header: _Header, samples: int, count: int) -> tuple[npt.NDArray
     return _as_int16(header, pixels), whole
 
 
-def _pixel_bytes(header: _Header) -> bytes:
+def _pixel_bytes(header: _Header) -> bytes | bytearray:
     source, offset = header.path, header.pixel_offset
     data_file = header.get("ElementDataFile")
     if data_file.upper() != "LOCAL":
@@ -225,7 +225,9 @@ def _pixel_bytes(header: _Header) -> bytes:
     with source.open("rb") as file:
         file.seek(offset)
         if header.get("CompressedData", "False").lower() != "true":
-            return file.read()
+            data = bytearray(max(source.stat().st_size - offset, 0))  # arrays on it can be written to: no copy is needed
+            file.readinto(data)
+            return data
         size = header.get("CompressedDataSize")
         if not size.isdigit() or int(size) == 0:
             raise header.refuse("CompressedDataSize is missing; compressed pixels need it, write the file again")
@@ -240,7 +242,7 @@ def _pixel_bytes(header: _Header) -> bytes:
 
 def _as_int16(header: _Header, pixels: npt.NDArray[np.generic]) -> npt.NDArray[np.int16]:
     if np.can_cast(pixels.dtype, np.int16, "safe"):
-        return pixels.astype(np.int16)
+        return pixels.astype(np.int16, copy=False)
     with np.errstate(invalid="ignore"):
         lines = pixels.astype(np.int16)
     if not np.array_equal(lines.astype(pixels.dtype), pixels):
