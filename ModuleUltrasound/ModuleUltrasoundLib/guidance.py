@@ -72,6 +72,17 @@ def rms_tre_mm(covariances: npt.ArrayLike, pivot_ras_mm: npt.ArrayLike, targets_
     return rms
 
 
+def covariance_with(
+    covariance: npt.ArrayLike, position_ras_mm: npt.ArrayLike, normal: npt.ArrayLike, pivot_ras_mm: npt.ArrayLike, sd_mm: float
+) -> Array:
+    """A motion's covariance (6, 6) after one more point: C - C r r' C / (s^2 + r' C r), r its row of `motion_rows`."""
+    covariance = np.asarray(covariance, dtype=float)
+    row = motion_rows(np.asarray(position_ras_mm)[None], np.asarray(normal)[None], pivot_ras_mm)[0]
+    gain = covariance @ row
+    after: Array = covariance - np.outer(gain, gain) / (sd_mm**2 + row @ gain)
+    return after
+
+
 def choose_next(
     points: ProtocolPoints,
     open_points: npt.ArrayLike,

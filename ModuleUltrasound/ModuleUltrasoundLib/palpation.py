@@ -6,13 +6,17 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import numpy as np
+import numpy.typing as npt
 from CranioNavLib.bone_points import BonePoints
 from CranioNavLib.errors import InputError
 from CranioNavLib.parameters import Limits, Parameters
 from CranioNavLib.rigid import Array
+
+if TYPE_CHECKING:
+    from ModuleUltrasoundLib.measure import LineMeasurements
 
 
 @dataclass(frozen=True)
@@ -296,6 +300,36 @@ class Sweep:
 
 def _shifted(cell: tuple[int, ...], offset: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(index + step - 1 for index, step in zip(cell, offset))
+
+
+def lines_of(measured: LineMeasurements, times_s: npt.ArrayLike, first_frame: int = 0) -> list[PalpationLine]:
+    """The measured frames of a recording, or of a piece of a stream, as lines for `Palpation` and `Sweep`.
+
+    Parameters
+    ----------
+    measured : LineMeasurements
+    times_s : array-like, shape (F,)
+        When each was taken.
+    first_frame : int
+        Number of the first of them in its recording.
+    """
+    times = np.asarray(times_s, dtype=float)
+    if len(times) != len(measured):
+        raise InputError(f"expected one time for each of {len(measured)} measured lines, got {len(times)}")
+    return [
+        PalpationLine(
+            time_s=float(times[k]),
+            accepted=bool(measured.accepted[k]),
+            quality=float(measured.qualities[k]),
+            reason=measured.reasons[k],
+            position_mm=measured.positions_mm[k],
+            covariance_mm2=measured.covariances_mm2[k],
+            beam=measured.beam_directions[k],
+            depth_mm=float(measured.depths_mm[k]),
+            frame=first_frame + k,
+        )
+        for k in range(len(times))
+    ]
 
 
 def to_bone_points(
