@@ -84,7 +84,7 @@ class PolarisTracker(Tracker):
         replies: Annotated[Replies, "BX is exact; TX rounds to 0.01 mm"] = Replies.AUTO
         volume: Annotated[Optional[int], Limits(0, 15), "index of the measuring volume to select"] = None
         frame_counter_hz: Annotated[Optional[float], Limits(1, 1000), "ticks of the frame counter; asked of the device"] = None
-        connect_timeout_s: Annotated[float, Limits(1, 120), "how long open() tries"] = 15.0
+        connect_timeout_s: Annotated[float, Limits(1, 120), "how long open() tries"] = 20.0
 
     def __init__(self, settings: Parameters | None = None) -> None:
         super().__init__(settings)
