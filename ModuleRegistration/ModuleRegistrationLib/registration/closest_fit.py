@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Optional
 
 import numpy as np
 import numpy.typing as npt
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array, transform_points
+from CranioNavLib.surface import Surface
 
-from ModuleRegistrationLib.registration.landmarks import motion_jacobian
+from ModuleRegistrationLib.registration.landmarks import fit_rigid, motion_jacobian
 from ModuleRegistrationLib.registration.problem import RegistrationProblem, RegistrationResult
 
 LEAST_POINTS = 6  # each point holds one degree of freedom of six
@@ -34,6 +36,50 @@ def check_problem(problem: RegistrationProblem) -> None:
             f"the bone points start {distance:.0f} mm from the skull; "
             "check the landmarks, their pairing and the frame of the points"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class ClosestFits:
+    """Where closest-point iterations from several starts ended."""
+
+    reference_to_ras: Array  # (M, 4, 4)
+    rms_mm: Array  # (M,) over the points kept
+    iterations: int
+    stop_reason: str
+
+
+def iterate_closest(
+    surface: Surface, points_mm: Array, starts: Array, max_iterations: int, tolerance_mm: float, keep_share: float = 1.0
+) -> ClosestFits:
+    """Closest points and fit in turn, from all starts at once, the chapter's equation (12).
+
+    Parameters
+    ----------
+    points_mm : ndarray, shape (N, 3), Reference
+    starts : ndarray, shape (M, 4, 4)
+    max_iterations, tolerance_mm
+        Stop at that many steps, or when no start's RMS distance falls by more than the tolerance.
+    keep_share : float
+        Share of the points, the closest ones, that each fit uses (Chetverikov 2002); 1: all.
+    """
+    kept = max(round(keep_share * len(points_mm)), LEAST_POINTS)
+    fits = np.asarray(starts, dtype=float)
+    previous, rms, iteration = np.full(len(fits), np.inf), np.full(len(fits), np.inf), 0
+    stop_reason = f"iteration limit {max_iterations}"
+    while iteration < max_iterations:
+        iteration += 1
+        moved = transform_points(fits, points_mm)
+        closest = surface.closest(moved.reshape(-1, 3))
+        distances = closest.distances_mm.reshape(moved.shape[:2])
+        chosen = np.argsort(distances, axis=1, kind="stable")[:, :kept]
+        rms = np.sqrt(np.mean(np.take_along_axis(distances, chosen, axis=1) ** 2, axis=1))
+        if (previous - rms < tolerance_mm).all():
+            stop_reason = f"RMS distance fell by less than {tolerance_mm:g} mm"
+            break
+        previous = rms
+        feet = np.take_along_axis(closest.points_mm.reshape(moved.shape), chosen[..., None], axis=1)
+        fits = fit_rigid(points_mm[chosen], feet)
+    return ClosestFits(fits, rms, iteration, stop_reason)
 
 
 def signed_distances(problem: RegistrationProblem, reference_to_ras: Array) -> tuple[Array, Array, Array]:

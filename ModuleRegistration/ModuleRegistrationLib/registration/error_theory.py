@@ -94,13 +94,23 @@ def length_statistics(covariances_mm2: npt.ArrayLike, degrees_of_freedom: Option
     largest = np.maximum(sds[..., 2], 1e-300)
     means, quantiles = _length_tables()
     middle, small = sds[..., 1] / largest, sds[..., 0] / largest
-    mean: Array = largest * means.ev(middle, small)
-    p95: Array = largest * quantiles.ev(middle, small)
-    total: Array = variances.sum(axis=-1)
+    mean = np.asarray(largest * means.ev(middle, small), dtype=np.float64)
+    p95 = np.asarray(largest * quantiles.ev(middle, small), dtype=np.float64)
+    total = np.asarray(variances.sum(axis=-1), dtype=np.float64)
     if degrees_of_freedom is not None:
         active = total**2 / np.maximum(np.sum(variances**2, axis=-1), 1e-300)  # 1 for a line, 3 for a sphere
-        p95 = p95 * np.sqrt(active * stats.f.ppf(0.95, active, degrees_of_freedom) / stats.chi2.ppf(0.95, active))
+        p95 *= np.sqrt(active * stats.f.ppf(0.95, active, degrees_of_freedom) / stats.chi2.ppf(0.95, active))
     return PredictedTre(mean, p95, np.sqrt(total))
+
+
+def probability_below(
+    covariance: npt.ArrayLike, pivot_ras_mm: npt.ArrayLike, targets_ras_mm: npt.ArrayLike, limit_mm: float
+) -> Array:
+    """(T,) probability that the error at a target is shorter than `limit_mm`; arguments as for predict_tre."""
+    jacobian = motion_jacobian(check_points(targets_ras_mm, "targets"), pivot_ras_mm)
+    variances = np.linalg.eigvalsh(jacobian @ np.asarray(covariance, dtype=float) @ np.swapaxes(jacobian, -1, -2))
+    sds = np.sqrt(np.maximum(variances, 1e-24))
+    return _probability_within(limit_mm / sds[:, 2], sds[:, 1] / sds[:, 2], sds[:, 0] / sds[:, 2])
 
 
 GRID = 21  # ratios 0, 0.05 ... 1 of the SDs: the tables are smooth, a cubic spline between them is good to 0.01%
@@ -126,6 +136,7 @@ def _probability_within(radius: Array, middle: Array, small: Array) -> Array:
     nodes, weights = np.polynomial.legendre.leggauss(40)
     angle = (nodes + 1) * np.pi / 4  # z1 = radius sin(angle): takes the square root's corner out
     turn = (np.arange(48) + 0.5) * np.pi / 2 / 48  # a quarter turn is enough, and the midpoint rule is exact for periods
+    radius = np.minimum(radius, 12.0)  # beyond, the probability is 1 in double precision
     z = radius[:, None] * np.sin(angle)
     rest = (radius[:, None] * np.cos(angle)) ** 2
     spread = (middle[:, None] * np.cos(turn)) ** 2 + (small[:, None] * np.sin(turn)) ** 2
@@ -158,4 +169,4 @@ def predict_tre_of(result: RegistrationResult, targets_ras_mm: npt.ArrayLike) ->
     """
     if result.covariance is None:
         raise InputError(f"method {result.method} gives no uncertainty; register with cranionav to get a predicted error")
-    return predict_tre(result.covariance, result.pivot_ras_mm, targets_ras_mm)
+    return predict_tre(result.covariance, result.pivot_ras_mm, targets_ras_mm, result.degrees_of_freedom)

@@ -12,7 +12,7 @@ from typing import Optional
 
 import numpy as np
 import numpy.typing as npt
-from CranioNavLib.rigid import Array, rigid, transform_points
+from CranioNavLib.rigid import Array, rigid, rigid_from_vector, rotate_covariances, transform_points
 
 from ModuleRegistrationLib.registration.landmark_checks import check_landmarks
 
@@ -136,6 +136,50 @@ def register_landmarks(
     )
 
 
+def fit_anisotropic(
+    patient_mm: npt.ArrayLike,
+    ct_mm: npt.ArrayLike,
+    patient_covariances_mm2: npt.ArrayLike,
+    ct_covariances_mm2: Optional[npt.ArrayLike] = None,
+) -> tuple[Array, Array]:
+    """Rigid transform that weighs each pair by its own 3D covariance, and the covariance of the result.
+
+    Parameters
+    ----------
+    patient_mm, ct_mm : array-like, shape (N >= 3, 3)
+    patient_covariances_mm2 : array-like, shape (N, 3, 3), Reference axes
+    ct_covariances_mm2 : array-like, shape (N, 3, 3), RAS axes, optional
+        Zero by default.
+
+    Returns
+    -------
+    reference_to_ras : ndarray, shape (4, 4)
+    covariance : ndarray, shape (6, 6)
+        Of rotation (rad) about the CT points' centroid and translation (mm), RAS axes.
+
+    References
+    ----------
+    Balachandran and Fitzpatrick, SPIE 7261, 2009; first-order covariance: Danilchenko and Fitzpatrick, IEEE TMI 30(3), 2011.
+    """
+    patient, ct, _ = check_landmarks(patient_mm, ct_mm)
+    measured = np.asarray(patient_covariances_mm2, dtype=float)
+    planned = np.zeros_like(measured) if ct_covariances_mm2 is None else np.asarray(ct_covariances_mm2, dtype=float)
+    reference_to_ras, pivot = fit_rigid(patient, ct), ct.mean(axis=0)
+    information = np.eye(6)
+    for _ in range(ANISOTROPIC_STEPS):
+        moved = transform_points(reference_to_ras, patient)
+        weights = np.linalg.inv(rotate_covariances(reference_to_ras, measured) + planned)
+        jacobian = motion_jacobian(moved, pivot)
+        pulled = np.swapaxes(jacobian, -1, -2) @ weights
+        information = (pulled @ jacobian).sum(axis=0)
+        step = np.linalg.solve(information, (pulled @ (ct - moved)[..., None]).sum(axis=0)[:, 0])
+        reference_to_ras = rigid_from_vector(step[:3], step[3:], pivot) @ reference_to_ras
+        if np.abs(step).max() < 1e-10:
+            break
+    return reference_to_ras, np.asarray(np.linalg.inv(information), dtype=np.float64)
+
+
+ANISOTROPIC_STEPS = 50
 PRIOR_FREEDOM = 3.0  # degrees of freedom that an expected FLE is worth: it is known to a factor of about 1.7
 
 

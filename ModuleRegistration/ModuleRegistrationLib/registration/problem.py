@@ -57,6 +57,7 @@ class RegistrationResult:
     speed_of_sound_sd_m_s: float = float("nan")
     surface_offset_mm: float = 0.0  # common distance of the points from the segmented surface
     minima: tuple[Minimum, ...] = ()  # all plausible ends of the search, best first
+    degrees_of_freedom: Optional[float] = None  # behind the scale of `covariance`; None: enough, or already in it
 
 
 class SurfaceRegistration(Plugin):
