@@ -26,7 +26,6 @@ from CranioNavLib.panel import Level, Progress, Reading, StepState, StepStatus, 
 from CranioNavLib.panel_model import PanelModel  # noqa: E402
 from ModuleRegistrationLib.panel_description import PANEL, RegistrationParameters  # noqa: E402
 
-STATUS_ATTRIBUTE = "CranioNav.Status"  # on ReferenceToRas: "landmarks", "accepted", "warning"
 LEVELS = {"accepted": Level.GOOD, "warning": Level.WARNING, "refused": Level.BAD, "landmarks": Level.WARNING}
 SURFACE_ATTRIBUTES = ("CranioNav.PositionSdMm", "CranioNav.OffsetSdMm")  # on OuterTable: what its segmentation promises
 
@@ -95,7 +94,7 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
             scene.release(role)
         registration = scene.find("ReferenceToRas")
         if registration is not None:
-            registration.RemoveAttribute(STATUS_ATTRIBUTE)
+            registration.RemoveAttribute(scene.STATUS_ATTRIBUTE)
             scene_data.set_transform("ReferenceToRas", [[float(row == column) for column in range(4)] for row in range(4)])
         scene_data.set_volume("CT", volume)
         return f"{volume.description}: {' × '.join(str(size) for size in volume.hu.shape[::-1])} voxels"
@@ -403,7 +402,7 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
     def _status(self):
         node = scene.find("ReferenceToRas")
-        return (node.GetAttribute(STATUS_ATTRIBUTE) or "") if node is not None else ""
+        return (node.GetAttribute(scene.STATUS_ATTRIBUTE) or "") if node is not None else ""
 
     def _rows(self):
         from ModuleRegistrationLib.result_tables import QUANTITY, VALUE
@@ -424,7 +423,7 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
             scene.release(role)
         self._writeRows(rows)
         node = scene.find_or_create("ReferenceToRas")
-        node.SetAttribute(STATUS_ATTRIBUTE, status)
+        node.SetAttribute(scene.STATUS_ATTRIBUTE, status)
         scene_data.set_transform("ReferenceToRas", matrix)
 
     def _plotResiduals(self):

@@ -89,6 +89,11 @@ class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         self._latest = []  # the last posed lines
         self._live = None  # what the last lines say: LineMeasurements
         self._liveTime = 0.0
+        self._guide = None  # where the probe stands to the current point
+        self._surface = (0, None)  # (time stamp of the mesh, Surface): the index over its triangles is worth keeping
+        self._palpation = None  # which points have been taken, while recording
+        self._palpated = None  # its last status
+        self._fedTime = 0.0  # time of the last line that palpation was given
         self._failure = ""
 
     # Protocol
@@ -125,7 +130,7 @@ class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         return points.positions_mm, np.stack([columns[name] for name in NORMALS], axis=1), points.labels
 
     def nextPoint(self):
-        """Go on to the next point of the protocol."""
+        """Go on to the next point of the protocol; the present one may be taken later."""
         self._goTo(min(self.currentIndex() + 1, self._count("ProtocolPoints") - 1))
 
     def nextPointBlocked(self):
@@ -147,7 +152,21 @@ class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         return int(text) if text and self._count("ProtocolPoints") else -1
 
     def _goTo(self, index):
+        """Ask for a point; where it is expected on the patient follows from the registration, once there is one."""
+        import numpy as np
+        from CranioNavLib.rigid import invert_rigid, transform_points
+
         scene.find_or_create("Protocol").SetParameter(CURRENT_POINT, str(index))
+        if self._palpation is not None and index >= 0:
+            expected = None
+            if self._registered():
+                target = np.array(scene.find("ProtocolPoints").GetNthControlPointPosition(index))[None]
+                expected = transform_points(invert_rigid(scene_data.get_transform("ReferenceToRas")), target)[0]
+            self._palpation.aim(index, expected)
+
+    def _registered(self):
+        node = scene.find("ReferenceToRas")
+        return node is not None and bool(node.GetAttribute(scene.STATUS_ATTRIBUTE))
 
     # Device
 
@@ -174,7 +193,7 @@ class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
             self._observation.stop()
         if self.stream is not None:
             self.stream.stop()
-        self.stream = self._poser = self._observation = self._live = None
+        self.stream = self._poser = self._observation = self._live = self._guide = self._palpation = None
         self._latest = []
 
     def disconnectBlocked(self):
@@ -219,17 +238,71 @@ class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         samples, rate = self._latest[-1].line.samples, self.stream.acquisition.sampling_hz
         scene_data.set_table("ALine", {"time (µs)": (1e6 / rate * _indices(samples)).tolist(), "amplitude": samples.tolist()})
         self._live = measure_lines(recording_of(self._latest, self.stream.acquisition), self.parameters().read().echo_settings())
+        self._takePoints()
+        self._steer()
+
+    def _takePoints(self):
+        """A point on which the probe has rested long enough is taken, and the next one is asked for."""
+        from ModuleUltrasoundLib.palpation import lines_of
+
+        if self._palpation is None:
+            return
+        new = False
+        for line in lines_of(self._live, [item.line.host_time_s for item in self._latest]):
+            if line.time_s <= self._fedTime:
+                continue
+            self._fedTime = line.time_s
+            self._palpated = self._palpation.add(line)
+            if self._palpated.new_point is not None:
+                new = True
+                if self._palpated.target is not None:
+                    self._goTo(self._palpated.target)
+        if new:
+            self._showTaken()
+
+    def _showTaken(self):
+        """The points taken so far as SurfacePoints; measuring the whole recording replaces them at the end."""
+        from ModuleUltrasoundLib.palpation import to_bone_points
+
+        taken, wanted = self._palpation.taken, self.parameters().read()
+        if not taken:
+            scene.release("SurfacePoints")
+            return
+        lines, labels = [point.line for point in taken], [point.label for point in taken]
+        scene_data.set_bone_points(to_bone_points(lines, labels, wanted.speed_of_sound_m_s, wanted.speed_of_sound_sd_m_s))
+
+    def _steer(self):
+        """Where the probe stands to the current point, under the registration in force."""
+        from ModuleUltrasoundLib.guidance import guide
+
+        index, pose = self.currentIndex(), scene_data.get_pose("ProbeToReference")
+        self._guide = None
+        if index < 0 or pose.matrix is None or not self._registered() or scene.find("OuterTable") is None:
+            return
+        positions, normals, _ = self.protocolPoints()
+        probe_to_ras = scene_data.get_transform("ReferenceToRas") @ pose.matrix
+        self._guide = guide(probe_to_ras, self._outerTable(), positions[index], normals[index])
+
+    def _outerTable(self):
+        stamp = scene.find("OuterTable").GetPolyData().GetMTime()
+        if self._surface[0] != stamp:
+            self._surface = (stamp, scene_data.get_surface("OuterTable"))
+        return self._surface[1]
 
     # Recording
 
     def startRecording(self):
-        """Record every line with its pose into `recording_path`. Returns a message."""
+        """Record every line with its pose into `recording_path`; points of the protocol are taken by resting on them."""
         from CranioNavLib.sequence_metafile import RecordingWriter
+        from ModuleUltrasoundLib.palpation import Palpation
 
         path = self.parameters().read().recording_path
         first = self._latest[-1].line
         self._recordingStart, self._recordedPoints = first.host_time_s, set()
         self._writer = RecordingWriter(path, len(first.samples), self.stream.acquisition)
+        if self._count("ProtocolPoints"):
+            self._palpation, self._fedTime = Palpation(scene_data.get_points("ProtocolPoints").labels), first.host_time_s
+            self._goTo(self.currentIndex())
         return f"recording into {path}"
 
     def startRecordingBlocked(self):
@@ -253,7 +326,18 @@ class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         for item in self._poser.ready(everything=True):
             self._record(item)
         self._writer.close()
-        self._writer = None
+        self._writer = self._palpation = self._palpated = None
+
+    def undoPoint(self):
+        """Take back the last point and return to it. Returns a message."""
+        point = self._palpation.undo()
+        self._goTo(point.target)
+        self._showTaken()
+        return f"{point.label} taken back"
+
+    def undoPointBlocked(self):
+        """Why there is no point to take back."""
+        return "" if self._palpation is not None and self._palpation.taken else "no point has been taken in this recording"
 
     def _record(self, item):
         if item.line.host_time_s <= self._recordingStart and self._writer.count:
@@ -334,6 +418,25 @@ class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         if index < 0:
             return None
         return Reading(f"{index + 1}. {scene.find('ProtocolPoints').GetNthControlPointLabel(index)}")
+
+    def guidance(self):
+        """What to do with the probe now."""
+        if self._guide is None:
+            return None
+        return Reading(self._guide.instruction, Level.GOOD if self._guide.on_target and self._guide.aligned else Level.WARNING)
+
+    def tilt(self):
+        """Angle between the beam and the bone's normal."""
+        if self._guide is None:
+            return None
+        return Reading(f"{self._guide.angle_deg:.1f}", Level.GOOD if self._guide.aligned else Level.WARNING)
+
+    def dwell(self):
+        """How many points are taken, and what the present one still lacks."""
+        if self._palpated is None:
+            return None
+        done = f"{self._palpated.taken} of {self._palpated.total} points, dwell {self._palpated.dwell:.0%}"
+        return Reading("; ".join(filter(None, [done, self._palpated.reason])))
 
     def recorded(self):
         """How much has been recorded."""
@@ -441,16 +544,24 @@ class ModuleUltrasoundTest(ScriptedLoadableModuleTest):
             self.session.hold_probe_at(0)
             self._run(poses, self.SECONDS_A_POINT)
             logic.startRecording()
-            for index in range(self.POINTS):
-                self.session.hold_probe_at(index)
-                self._run(poses, self.SECONDS_A_POINT)
-                logic.nextPoint()
+            for _ in range(self.POINTS):
+                self._palpate(poses)
             self.delayDisplay(logic.stopRecording().run())
         points = scene_data.get_bone_points("SurfacePoints")
         assert len(points) >= self.POINTS, f"{len(points)} points from {self.POINTS} places"
         in_ras = transform_points(patient.true_reference_to_ras, points.positions_mm)
         distances = patient.bone.closest(in_ras).distances_mm
         assert distances.max() < self.LARGEST_DISTANCE_MM, f"a bone point lies {distances.max():.2f} mm from the bone"
+
+    def _palpate(self, poses):
+        """The hand goes to the point that is asked for and rests there until it is taken, or is skipped."""
+        asked = self.logic.currentIndex()
+        self.session.hold_probe_at(asked)
+        for _ in range(10):
+            self._run(poses, self.SECONDS_A_POINT / 5)
+            if self.logic.currentIndex() != asked:
+                return
+        self.logic.nextPoint()
 
     def _run(self, poses, seconds):
         """The event loop, for some seconds: the tracking module's part writes the probe's pose, ours reads it."""

@@ -21,7 +21,7 @@ from ModuleUltrasoundLib.device import AModeDevice, DeviceError, RfLine
 QUEUE_LINES = 2048  # ten seconds at 200 lines a second: longer than any redraw blocks the main thread
 READ_S = 0.1
 RETRY_S = 0.5  # a device that returns is found again well within 2 s
-LONGEST_WAIT_S = 0.08  # a line waits so long for the pose after it
+LONGEST_WAIT_S = 0.3  # a line waits so long for the pose after it: longer than redraws keep the poses from being taken over
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from CranioNavLib import host
 from CranioNavLib.errors import InputError
 
 ROLE_ATTRIBUTE = "CranioNav.Role"
+STATUS_ATTRIBUTE = "CranioNav.Status"  # on ReferenceToRas: "landmarks", "accepted", "warning"; none: not registered
 FOLDER = "CranioNav"  # the folder of the subject hierarchy that holds the shared nodes
 
 TRACKING, ULTRASOUND, REGISTRATION = "ModuleTracking", "ModuleUltrasound", "ModuleRegistration"

@@ -117,7 +117,7 @@ def test_a_line_waits_no_longer_than_it_must_and_then_has_no_pose():
     poser.add_pose(np.eye(4), "OK", 0.9)
     poser.add_line(line(1, 1.0))
     assert poser.ready() == []
-    now[0] = 1.2
+    now[0] = 1.4
     (posed,) = poser.ready()
     assert not posed.pose.usable
 
