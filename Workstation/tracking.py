@@ -184,6 +184,8 @@ def record_session(
                     table.write(frame[0].host_time_s - begin, frame)
                 frames_in_table += len(frames)
             redraw()
+            if not frames and getattr(tracker, "finished", False):  # a replay at its end
+                break
             if device is None:
                 time.sleep(TURN_S)
         duration_s = time.monotonic() - begin

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -96,6 +97,33 @@ def test_record_writes_recording_and_table(capsys, a_table, tmp_path):
     assert len(table) >= report["frames"] - 2
     assert {row.tool for row in table[0]} == {"Probe", "Reference", "Stylus"}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.csv", "out.csv", "out.igs.mha"]
+
+
+def test_a_replay_that_is_not_looped_ends_the_recording(capsys, a_table, tmp_path):
+    settings = ["-s", f"path={a_table}", "-s", "loop=no", "-s", "speed=4"]
+    assert run(["tracker", "record", "replay", *settings, "--csv", str(tmp_path / "out.csv"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["frames"] > 100
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a pseudo-terminal")
+def test_a_terminal_shows_the_tools_live(a_table):
+    import pty
+
+    ours, theirs = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "120"}
+    command = cranionav("tracker", "probe", "replay", "-s", f"path={a_table}", "--seconds", "1.5", "--json")
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=theirs, env=environment)
+    os.close(theirs)
+    shown = b""
+    with contextlib.suppress(OSError):  # the other end was closed
+        while data := os.read(ours, 65536):
+            shown += data
+    os.close(ours)
+    assert process.wait() == 0
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.decode("utf-8", "replace"))
+    assert re.search(r"tool\W+status\W+x mm\W+y mm\W+z mm\W+error mm\W+rate 1/s\W+age ms", text)
+    assert re.search(r"Probe\W+OK", text)
+    assert re.search(r"Stylus\W+MISSING\W+–\W+–\W+–\W+–", text)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends SIGINT and SIGKILL")

@@ -18,6 +18,7 @@ from ModuleTrackingLib.pose_csv import PoseRow, read_pose_csv
 from ModuleTrackingLib.tracker import TRACKERS, PoseStatus, ToolInfo, ToolPose, Tracker, TrackerError
 
 REFERENCE = "Reference"
+END_S = 0.05  # a recording at its end answers this slowly, so that whoever polls it does not spin
 
 
 @dataclass(frozen=True)
@@ -70,16 +71,19 @@ class ReplayTracker(Tracker):
         self._begin_s = time.monotonic()
 
     def read(self, timeout_s: float = 1.0) -> list[ToolPose]:
-        """The next frame when it is due; at once with speed 0.
+        """The next frame when it is due; at once with speed 0. Empty for good when the recording is `finished`.
 
         Raises
         ------
         TrackerError
-            The recording is at its end and is not looped.
+            It is not open.
         """
+        if not self._frames:
+            raise TrackerError("replay: not open; open it first")
+        if self.finished:
+            time.sleep(min(timeout_s, END_S))
+            return []
         if self._next >= len(self._frames):
-            if not self.settings.loop:
-                raise TrackerError("the recording is at its end; start it again or loop it")
             self._next = 0
         frame = self._frames[self._next]
         device_s = math.nan
@@ -101,6 +105,11 @@ class ReplayTracker(Tracker):
     def close(self) -> None:
         """Let go of the recording."""
         self._frames = []
+
+    @property
+    def finished(self) -> bool:
+        """Whether a recording that is not looped is at its end."""
+        return not self.settings.loop and self._next >= len(self._frames)
 
     @property
     def tools(self) -> list[ToolInfo]:

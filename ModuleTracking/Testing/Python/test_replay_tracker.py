@@ -72,8 +72,11 @@ def test_a_frame_that_is_not_due_is_not_given(tmp_path):
 
 
 def test_the_end_is_told_or_begins_again(a_table):
-    with pytest.raises(TrackerError, match="at its end"):
-        replayed(a_table, 31, speed=0, loop=False)
+    with ReplayTracker(ReplaySettings(path=str(a_table), speed=0, loop=False)) as tracker:
+        frames = [tracker.read() for _ in range(30)]
+        assert all(frames)
+        assert tracker.finished
+        assert tracker.read() == tracker.read() == []
     frames = replayed(a_table, 31, speed=100)
     np.testing.assert_array_equal(frames[30][0].tool_to_tracker, frames[0][0].tool_to_tracker)
     assert frames[30][0].device_time_s > frames[29][0].device_time_s
@@ -100,6 +103,11 @@ def test_a_recording_without_a_tracker_frame_is_replayed_in_reference(tmp_path):
     np.testing.assert_array_equal(first["Probe"].tool_to_tracker, a_pose(1))
     np.testing.assert_array_equal(first["Reference"].tool_to_tracker, np.eye(4))
     assert second["Probe"].status is PoseStatus.MISSING
+
+
+def test_reading_before_opening_is_told(a_table):
+    with pytest.raises(TrackerError, match="not open"):
+        ReplayTracker(ReplaySettings(path=str(a_table))).read()
 
 
 def test_no_path_is_refused():
