@@ -28,6 +28,7 @@ class Candidates:
     amplitudes: Array  # (n, K) envelope
     phases: Array  # (n, K) phase of the RF at the echo's centre, rad
     widths_s: Array  # (n, K) standard deviation of the Gaussian that fits the envelope's top
+    frequencies_hz: Array  # (n, K) instantaneous frequency at the centre: attenuation draws it down
     saliences_db: Array  # (n, K) over the mean level around
     before_db: Array  # (n, K) mean level in the stretch just before, over the noise
     after_db: Array  # (n, K) just behind
@@ -52,7 +53,8 @@ class Levels:
         """Mean logarithm over [first, last) of each line, indices (n, K); NaN for empty stretches."""
         length = self.log.shape[1]
         first, last = np.clip(first, 0, length), np.clip(last, 0, length)
-        total = np.take_along_axis(self.sums, last, axis=1) - np.take_along_axis(self.sums, first, axis=1)
+        rows = np.arange(len(self.sums))[:, None]
+        total = self.sums[rows, last] - self.sums[rows, first]
         return np.asarray(np.where(last > first, total / np.maximum(last - first, 1), np.nan), dtype=float)
 
 
@@ -89,7 +91,8 @@ def refine_peaks(magnitude: Floats, samples: npt.NDArray[np.int64]) -> tuple[Arr
 def fit_tops(magnitude: Floats, samples: npt.NDArray[np.int64]) -> tuple[Array, Array, Array]:
     """As refine_peaks, and the standard deviation (samples) of the Gaussian that has each peak's curvature."""
     safe = np.clip(samples, 1, magnitude.shape[1] - 2)
-    left, mid, right = (np.log(np.take_along_axis(magnitude, safe + step, axis=1).astype(float) + 1e-9) for step in (-1, 0, 1))
+    rows = np.arange(len(magnitude))[:, None]
+    left, mid, right = (np.log(magnitude[rows, safe + step].astype(float) + 1e-9) for step in (-1, 0, 1))
     curvature = np.minimum(left - 2 * mid + right, -1e-6)
     offset = np.clip(0.5 * (left - right) / curvature, -0.5, 0.5)
     height = np.exp(mid - 0.25 * (left - right) * offset)
@@ -143,9 +146,12 @@ def find_candidates(
     rise = TYPICAL_ATTENUATION * transducer_hz * 1e-6 * 154e3  # dB a second of delay: 77 km/s of depth, both ways, per cm
     samples = salient_peaks(levels, rate, rise, first, last)
     positions, heights, widths = fit_tops(magnitude, samples)
-    complex_values = np.take_along_axis(envelopes.values, np.clip(samples, 0, None), axis=1)
+    rows = np.arange(len(samples))[:, None]
+    complex_values = envelopes.values[rows, np.clip(samples, 0, None)]
     # the baseband phase hardly changes within a sample; the carrier's phase is that of the refined time
     phases = np.angle(complex_values) + 2 * np.pi * envelopes.carrier_hz * (positions / rate)
+    ahead, back = (envelopes.values[rows, np.clip(samples + k, 0, magnitude.shape[1] - 1)] for k in (1, -1))
+    turn = np.angle(ahead * back.conj())
     guard, near, reach = (int(x * rate) for x in (GUARD_CYCLES / transducer_hz, NEAR_S, SALIENCE_S))
     skin_sample = np.full_like(samples, int(skin * rate) + guard)
     end = np.full_like(samples, magnitude.shape[1])
@@ -157,6 +163,7 @@ def find_candidates(
         amplitudes=heights,
         phases=phases,
         widths_s=widths / rate,
+        frequencies_hz=np.where(samples < 0, np.nan, envelopes.carrier_hz + turn * rate / (4 * np.pi)),
         saliences_db=DECIBEL * (np.log(heights) - around),
         before_db=DECIBEL * (levels.mean(start_near, samples - guard) - base),
         after_db=DECIBEL * (levels.mean(samples + guard, samples + guard + near) - base),
@@ -168,7 +175,7 @@ def find_candidates(
 
 def _none(count: int, noise: Array) -> Candidates:
     empty = np.full((count, CANDIDATES), np.nan)
-    return Candidates(empty, empty, empty, empty, empty, empty, empty, empty, empty, noise)
+    return Candidates(empty, empty, empty, empty, empty, empty, empty, empty, empty, empty, noise)
 
 
 def concatenate(parts: list[Candidates]) -> Candidates:

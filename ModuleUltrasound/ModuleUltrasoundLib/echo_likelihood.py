@@ -61,6 +61,7 @@ SHARED_NAMES = (
     "has neighbours",
     "static",
     "contact",
+    "slope",
 )
 
 
@@ -72,7 +73,7 @@ def shared_features(found: Found, scores: Array, runs: npt.NDArray[np.int64]) ->
     candidates, depth_mm = found.candidates, found.depths_mm
     valid = np.isfinite(depth_mm)
     chance, _ = probabilities(scores, valid)
-    strength, strength_known = relative_strength(candidates, chance, depth_mm)
+    strength, strength_known, slope = relative_strength(candidates, chance, depth_mm)
     polarity, polarity_known = relative_polarity(candidates.phases - found.forerun_phases[:, None], chance)
     support, neighbours = neighbour_support(chance, depth_mm, runs)
     features = [
@@ -85,22 +86,23 @@ def shared_features(found: Found, scores: Array, runs: npt.NDArray[np.int64]) ->
         np.broadcast_to(neighbours[:, None], scores.shape),
         static_share(depth_mm, runs),
         np.broadcast_to(contact(found.forerun.amplitude)[:, None], scores.shape),
+        np.full(scores.shape, slope / 3),
     ]
     return np.nan_to_num(np.stack([np.where(valid, feature, 0.0) for feature in features], axis=-1))
 
 
-def relative_strength(candidates: Candidates, chance: Array, depth_mm: Array) -> tuple[Array, float]:
+def relative_strength(candidates: Candidates, chance: Array, depth_mm: Array) -> tuple[Array, float, float]:
     """Level of each candidate over what a bone of its depth shows in this recording, in units of 15 dB.
 
     The bone's level falls with depth by the tissue's attenuation: a straight line through the likely bones of all lines,
-    its slope shrunk to the middle of what tissue has.
+    its slope shrunk to none. Also how far the line is known (0 to 1), and its slope (dB/mm).
     """
     level = DECIBEL * np.log(np.maximum(candidates.amplitudes, 1e-9))
     best = chance.argmax(axis=1)
     rows = np.arange(len(chance))
     weight = np.where(chance[rows, best] > 0.5, chance[rows, best], 0.0)
     if (weight > 0).sum() < LEAST_FOR_SHARED:
-        return np.zeros(level.shape), 0.0
+        return np.zeros(level.shape), 0.0, 0.0
     y, x = np.nan_to_num(level[rows, best]), np.nan_to_num(depth_mm[rows, best])
     slope, middle_x, middle_y = 0.0, 0.0, 0.0
     for _ in range(3):
@@ -113,7 +115,7 @@ def relative_strength(candidates: Candidates, chance: Array, depth_mm: Array) ->
         weight = np.where(chance[rows, best] > 0.5, chance[rows, best], 0.0) / (1 + (np.where(off < 0, off / 6, off / 12)) ** 2)
     expected = middle_y + slope * (depth_mm - middle_x)
     known = float(min(weight.sum() / 10, 1.0))
-    return np.clip((level - expected) / 15, -3, 3) * known, known
+    return np.clip((level - expected) / 15, -3, 3) * known, known, slope * known
 
 
 def relative_polarity(phases: Array, chance: Array) -> tuple[Array, float]:

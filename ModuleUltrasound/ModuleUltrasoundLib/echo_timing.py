@@ -50,7 +50,8 @@ def shift_windows(windows: Complexes, offset: Array) -> npt.NDArray[np.complex12
     whole = np.floor(offset).astype(np.int64)
     part = (offset - whole)[:, None]
     index = np.arange(windows.shape[1]) + 2 + whole[:, None]
-    a, b, c, d = (np.take_along_axis(padded, np.clip(index + k, 0, padded.shape[1] - 1), axis=1) for k in (-1, 0, 1, 2))
+    rows = np.arange(len(padded))[:, None]
+    a, b, c, d = (padded[rows, np.clip(index + k, 0, padded.shape[1] - 1)] for k in (-1, 0, 1, 2))
     return np.asarray(
         b + 0.5 * part * (c - a) + part**2 * (a - 2.5 * b + 2 * c - 0.5 * d) + part**3 * (-0.5 * a + 1.5 * b - 1.5 * c + 0.5 * d)
     )
@@ -80,13 +81,13 @@ def fit_echoes(windows: Complexes, offset: Array, pulse: Pulse) -> tuple[Array, 
     w = pulse.values[core]
     slope = np.gradient(pulse.values)[core]
     shift = np.zeros(len(windows))
-    amplitude = np.zeros(len(windows), dtype=complex)
+    amplitude: npt.NDArray[np.complex128] = np.zeros(len(windows), dtype=np.complex128)
     gram = np.array([[np.vdot(w, w), np.vdot(w, slope)], [np.vdot(slope, w), np.vdot(slope, slope)]])
     inverse = np.linalg.inv(gram)
     for _ in range(2):
         y = shift_windows(windows, np.clip(offset + shift, -1.5, 1.5))[:, core]
         coefficients = np.stack([y @ w.conj(), y @ slope.conj()], axis=1) @ inverse.T
-        amplitude = coefficients[:, 0]
+        amplitude = np.asarray(coefficients[:, 0], dtype=np.complex128)
         step = -(coefficients[:, 1] / np.where(amplitude == 0, 1, amplitude)).real
         shift = np.clip(shift + np.clip(step, -0.5, 0.5), -1.0, 1.0)
     y = shift_windows(windows, np.clip(offset + shift, -1.5, 1.5))[:, core]

@@ -32,11 +32,14 @@ class EchoSettings(Parameters):
     # 1450 to 1630 m/s is the range of soft tissue over bone in the chapter; mean and SD of the uniform law over it
     speed_of_sound_m_s: Annotated[float, Limits(1300, 1800), "speed of sound in the tissue: mean of the prior"] = 1540.0
     speed_of_sound_sd_m_s: Annotated[float, Limits(0, 200), "speed of sound in the tissue: SD of the prior"] = 52.0
-    least_depth_mm: Annotated[float, Limits(0, 20), "no bone is looked for above this depth"] = 1.0
+    least_depth_mm: Annotated[float, Limits(0, 20), "no bone is looked for above this depth"] = 1.4
     most_depth_mm: Annotated[float, Limits(2, 60), "no bone is looked for below this depth"] = 20.0
     quality_gate: Annotated[float, Limits(0, 1), "frames below this quality are not points"] = 0.85
     beam_width_mm: Annotated[float, Limits(0, 10), "-6 dB width of the beam"] = 1.2
     tilt_sd_deg: Annotated[float, Limits(0, 20), "SD of the angle between beam and bone normal"] = 2.0
+
+
+DEFAULT_SETTINGS = EchoSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +82,7 @@ def measure_lines(recording: Recording, settings: EchoSettings | None = None) ->
     InputError
         The recording's header cannot be that of pulse-echo lines.
     """
-    settings = settings or EchoSettings()
+    settings = settings or DEFAULT_SETTINGS
     runs = stays(recording)
     single, both = networks()
     found = search_lines(

@@ -21,6 +21,7 @@ Floats = npt.NDArray[np.float32]
 BAND_CENTRE = 0.92  # of the transducer's frequency
 BAND_WIDTH = 0.75  # full width at half amplitude, of the transducer's frequency
 BAND_EDGES = (0.25, 1.9)  # of the transducer's frequency: nothing outside gets through (drift, spikes' upper part)
+LEAST_DRIFT = 8.0  # codes over a line: less makes no step that matters
 OVERSAMPLING = 4.0  # complex samples a cycle of the transducer's frequency
 
 
@@ -112,16 +113,20 @@ def complex_envelopes(lines: npt.NDArray[np.int16], band: Band) -> Envelopes:
 
 
 def remove_drift(lines: npt.NDArray[np.int16]) -> Floats:
-    """Lines as float32 without their straight-line drift, which is taken from the quiet second half.
+    """Lines as float32 without offset, and without their straight-line drift where they have one.
 
-    Slower waves are left to the band-pass; only the step between a line's end and its start would pass it.
+    Both are taken from the quiet second half. Slower waves are left to the band-pass; only the step between a line's end and
+    its start would pass it.
     """
     rf = lines.astype(np.float32)
-    quarter = max(rf.shape[1] // 4, 1)
+    length = rf.shape[1]
+    quarter = max(length // 4, 1)
     third = rf[:, -2 * quarter : -quarter].mean(axis=1)
     fourth = rf[:, -quarter:].mean(axis=1)
     slope = (fourth - third) / np.float32(quarter)
-    base = fourth - slope * np.float32(rf.shape[1] - quarter / 2 - 0.5)
-    ramp = np.stack([np.ones(rf.shape[1], dtype=np.float32), np.arange(rf.shape[1], dtype=np.float32)])
-    rf -= np.stack([base, slope], axis=1) @ ramp
+    rf -= fourth[:, None]
+    drifting = np.flatnonzero(np.abs(slope) * length > LEAST_DRIFT)
+    if len(drifting):
+        ramp = np.arange(length, dtype=np.float32) - np.float32(length - quarter / 2 - 0.5)
+        rf[drifting] -= slope[drifting, None] * ramp
     return rf

@@ -9,13 +9,14 @@ kept out of the fit and judges it. The same seed gives the same table.
 from __future__ import annotations
 
 import argparse
+import textwrap
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from ModuleUltrasoundLib.echo_likelihood import Network, shared_features
+from ModuleUltrasoundLib.echo_likelihood import Network, probabilities, shared_features
 from ModuleUltrasoundLib.echo_search import Found, search_lines
 from ModuleUltrasoundLib.measure import stays
 
@@ -44,7 +45,7 @@ def make_world(seed: int) -> World:
     recording, truth, world = simulate(rng, frames, without_bone=float(rng.choice([0.1, 0.3, 0.6])))
     runs = stays(recording)
     assumed = world.speed_m_s if rng.random() < 0.7 else float(rng.uniform(1450, 1630))
-    found = search_lines(recording, assumed, (1.0, 20.0), bool(runs.max(initial=0) >= 2))
+    found = search_lines(recording, assumed, (1.4, 20.0), bool(runs.max(initial=0) >= 2))
     true = truth.depth_mm * assumed / world.speed_m_s
     off = np.abs(found.depths_mm - true[:, None])
     off = np.where(np.isfinite(off), off, np.inf)
@@ -112,24 +113,27 @@ def shared_of(world: World, single: Network) -> Array:
 
 
 def write_weights(networks: dict[str, Network], note: str) -> None:
-    """The networks as a Python file of numbers."""
+    """The networks as a Python file of numbers, four digits each."""
     lines = [
-        '"""Constants of the bone likelihood. Written by Testing/Studies/calibrate_echo.py; do not edit by hand.\n',
-        f"{note}\n" + '"""\n',
-        "from __future__ import annotations\n",
-        "# ruff: noqa: E501\n",
+        '"""Constants of the bone likelihood. Written by Testing/Studies/calibrate_echo.py; do not edit by hand.',
+        "",
+        f'{note}\n"""',
+        "",
+        "# fmt: off",
+        "from __future__ import annotations",
     ]
     for name, network in networks.items():
-        lines.append(f"{name} = (")
+        lines += ["", f"{name} = ("]
         for weight, bias in network.layers:
-            lines.append("    (")
-            lines.append("        (")
-            lines += ["            (" + ", ".join(f"{value:.4g}" for value in row) + ",)," for row in weight]
-            lines.append("        ),")
-            lines.append("        (" + ", ".join(f"{value:.4g}" for value in bias) + ",),")
-            lines.append("    ),")
+            rows = [_row(row) for row in weight]
+            lines += ["(", "(", *(line for row in rows for line in row), "),", *_row(bias), "),"]
         lines.append(")")
     OUTPUT.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _row(values: Array) -> list[str]:
+    """One tuple of numbers, wrapped."""
+    return textwrap.wrap("(" + ", ".join(f"{value:.4g}" for value in values) + ",),", 125)
 
 
 def main() -> None:
@@ -161,8 +165,6 @@ def main() -> None:
 
 def judge(network: Network, features: list[Array], worlds: list[World]) -> str:
     """How well the held-out worlds are told: log loss, right among the sure, found among the findable."""
-    from ModuleUltrasoundLib.echo_likelihood import probabilities
-
     loss, sure, right, bone, none_sure, none = 0.0, 0, 0, 0, 0, 0
     lines = 0
     for one, world in zip(features, worlds):

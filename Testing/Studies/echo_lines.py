@@ -6,7 +6,7 @@ to these lines is fitted to one simulator. All of it is simulated; ranges from t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,7 @@ SPEED_M_S = (1450.0, 1630.0)
 ATTENUATION_DB_CM_MHZ = (0.3, 2.6)
 DEPTH_MM = (2.0, 15.0)
 SNR_DB = (12.0, 40.0)
+PLAIN_SHARE = 0.3  # of the worlds are textbook ones
 BONE_SPEED_M_S = (2700.0, 3500.0)
 
 
@@ -57,6 +58,7 @@ class World:
     layers: int
     inner_db: float  # inner table under the outer one
     bone_mm: float
+    bone_speed_m_s: float
     ringing: float
     ringing_s: float
     spikes: float  # a line
@@ -67,7 +69,6 @@ class World:
     largest_code: int
     frames_a_point: int
     sweep: bool
-    extra: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +117,9 @@ def draw_world(rng: np.random.Generator, frames_a_point: int | None = None) -> W
         speckle_per_us=rng.uniform(2, 8),
         galea_db=(a := rng.uniform(8, 24), a + rng.uniform(0, 10)),
         layers=int(rng.integers(0, 4)),
-        inner_db=rng.uniform(5, 25) if rng.random() < 0.8 else 99.0,
+        inner_db=rng.uniform(6, 25) if rng.random() < 0.8 else 99.0,
         bone_mm=rng.uniform(2.5, 9),
+        bone_speed_m_s=rng.uniform(*BONE_SPEED_M_S),
         ringing=rng.uniform(0, 3) * (rng.random() < 0.8),
         ringing_s=rng.uniform(0.1, 0.4) * 1e-6,
         spikes=rng.choice([0.0, rng.uniform(0, 1.5)]),
@@ -128,6 +130,27 @@ def draw_world(rng: np.random.Generator, frames_a_point: int | None = None) -> W
         largest_code=int(rng.choice([511, 2047, 8191, 32767], p=[0.1, 0.2, 0.3, 0.4])),
         frames_a_point=frames_a_point or int(rng.choice([1, 3, 10, 20])),
         sweep=bool(rng.random() < 0.3),
+    )
+
+
+def plain(world: World, rng: np.random.Generator) -> World:
+    """The same set-up as a textbook would draw it: a clean symmetric pulse, weak interfaces, no accidents."""
+    return replace(
+        world,
+        pulse="gauss",
+        bandwidth=rng.uniform(0.4, 0.8),
+        forerun_shown=True,
+        tilt_law=str(rng.choice(["specular", "cosine", "none"])),
+        tilt_width_deg=rng.uniform(3, 8),
+        galea_db=(a := rng.uniform(11, 26), a + rng.uniform(0, 4)),
+        layers=int(rng.integers(0, 3)),
+        ringing=world.ringing * (rng.random() < 0.5),
+        spikes=world.spikes * (rng.random() < 0.3),
+        noise_band=0.0,
+        drift=0.0,
+        offset=0.0,
+        full_scale=rng.uniform(0.3, 1.0),
+        largest_code=int(rng.choice([2047, 8191, 32767])),
     )
 
 
@@ -168,7 +191,9 @@ def simulate(
     rng: np.random.Generator, frames: int, world: World | None = None, without_bone: float = 0.2, most_tilt_deg: float = 5.0
 ) -> tuple[Recording, Truth, World]:
     """A recording of `frames` lines in one world, and the truth about it."""
-    world = world or draw_world(rng)
+    if world is None:
+        world = draw_world(rng)
+        world = plain(world, rng) if rng.random() < PLAIN_SHARE else world
     count = -(-frames // world.frames_a_point)
     repeat = np.repeat(np.arange(count), world.frames_a_point)[:frames]
     wander = 0.15 * np.cumsum(rng.normal(size=frames)) * 0.3
@@ -257,7 +282,7 @@ def _line(
     if kind == "bone":
         arrival = skin + 2e-3 * depth / speed
         add(arrival, bone, depth)
-        inner = arrival + 2e-3 * world.bone_mm / rng.uniform(*BONE_SPEED_M_S)
+        inner = arrival + 2e-3 * world.bone_mm * rng.uniform(0.9, 1.1) / world.bone_speed_m_s
         add(inner, -bone * 10 ** (-world.inner_db / 20), depth)
         for _ in range(rng.integers(0, 6)):  # diploe
             add(rng.uniform(arrival, inner), bone * rng.normal(0, 0.03), depth)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.sequence_metafile import Acquisition
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from ModuleUltrasoundLib.echo_candidates import refine_peaks
 from ModuleUltrasoundLib.signal_chain import check_acquisition, complex_envelopes, design_band, remove_drift
@@ -29,9 +29,10 @@ def peak_time(line, acquisition):
     st.floats(0.35, 0.9),
 )
 def test_peak_of_the_envelope_stays_where_a_symmetric_pulse_has_its_centre(centre, rate, at, phase, bandwidth):
+    assume(rate > 3.5 * centre)  # else the pulse itself reaches beyond half the sampling rate
     time = np.arange(int(26e-6 * rate)) / rate
     line = np.round(20000 * gaussian_echo(time, centre, at, phase, bandwidth)).astype(np.int16)
-    assert peak_time(line, Acquisition(rate, centre)) == pytest.approx(at, abs=0.02 / centre)
+    assert peak_time(line, Acquisition(rate, centre)) == pytest.approx(at, abs=0.04 / centre)  # 4 % of a wavelength: 0.01 mm
 
 
 def test_envelope_of_a_tone_in_the_band_is_its_amplitude():
