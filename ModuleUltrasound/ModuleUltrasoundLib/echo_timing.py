@@ -100,7 +100,8 @@ def fit_echoes(windows: Complexes, offset: Array, pulse: Pulse) -> tuple[Array, 
     shift_sd = np.sqrt(correlated * quadrature / power * inverse[1, 1].real)
     phase_sd = np.sqrt(correlated * quadrature / power / np.vdot(w, w).real)
     misfit = rest / np.maximum((np.abs(y) ** 2).sum(axis=1), 1e-12)
-    return shift, shift_sd, np.angle(amplitude), phase_sd, misfit
+    phase = np.asarray(np.angle(amplitude), dtype=np.float64)
+    return np.asarray(shift), shift_sd, phase, phase_sd, misfit
 
 
 def common_phase(phases: Array, chance: Array) -> tuple[float, float]:
