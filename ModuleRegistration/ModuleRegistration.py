@@ -27,7 +27,8 @@ from CranioNavLib.panel_model import PanelModel  # noqa: E402
 from ModuleRegistrationLib.panel_description import PANEL, RegistrationParameters  # noqa: E402
 
 LEVELS = {"accepted": Level.GOOD, "warning": Level.WARNING, "refused": Level.BAD, "landmarks": Level.WARNING}
-SURFACE_ATTRIBUTES = ("CranioNav.PositionSdMm", "CranioNav.OffsetSdMm")  # on OuterTable: what its segmentation promises
+# on OuterTable: what its segmentation promises
+POSITION_SD, OFFSET_SD, THRESHOLD = "CranioNav.PositionSdMm", "CranioNav.OffsetSdMm", "CranioNav.ThresholdHu"
 
 
 class ModuleRegistration(ScriptedLoadableModule):
@@ -164,7 +165,8 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
     def _takeBone(self, bone):
         scene_data.set_surface("Bone", bone.closed)
         table = scene_data.set_surface("OuterTable", bone.outer_table)
-        for attribute, value in zip(SURFACE_ATTRIBUTES, (bone.position_sd_mm, bone.offset_sd_mm)):
+        promised = {POSITION_SD: bone.position_sd_mm, OFFSET_SD: bone.offset_sd_mm, THRESHOLD: bone.threshold_hu}
+        for attribute, value in promised.items():
             table.SetAttribute(attribute, repr(float(value)))
         return f"bone at {bone.threshold_hu:.0f} HU: {len(bone.outer_table.triangles)} triangles on the outer table"
 
@@ -191,6 +193,52 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
     def findMarkersBlocked(self):
         """Why markers cannot be searched now."""
         return self.segmentBoneBlocked()
+
+    def findSkin(self):
+        """Find the skin in the CT of the scene; writes Skin."""
+        from ModuleRegistrationLib.anatomy.skin import skin_surface
+
+        volume = scene_data.get_volume("CT")
+
+        def find(progress: Progress):
+            progress("finding the skin", 0.1)
+            return skin_surface(volume)
+
+        def take(skin):
+            scene_data.set_surface("Skin", skin)
+            return f"skin: {len(skin.triangles)} triangles"
+
+        return Task("Find skin", find, take)
+
+    def findSkinBlocked(self):
+        """Why the skin cannot be searched now."""
+        return self.segmentBoneBlocked()
+
+    def suggestLandmarks(self):
+        """Propose the anatomical landmarks on the skull found; they become LandmarksCT, for the user to check and move."""
+        from CranioNavLib.slicer_files import LabelledPoints
+        from ModuleRegistrationLib.anatomy.landmark_suggestions import suggest_landmarks
+        from ModuleRegistrationLib.anatomy.segmentation import BoneSurfaces
+
+        table = scene.find("OuterTable")
+        known = [float(table.GetAttribute(name) or "nan") for name in (THRESHOLD, POSITION_SD, OFFSET_SD)]
+        bone = BoneSurfaces(scene_data.get_surface("Bone"), scene_data.get_surface("OuterTable"), *known)
+
+        def suggest(progress: Progress):
+            progress("looking for landmarks", 0.1)
+            return suggest_landmarks(bone)
+
+        def take(found):
+            scene_data.set_points("LandmarksCT", LabelledPoints(tuple(found.labels), found.positions_ras_mm))
+            return f"{', '.join(found.labels)}: suggested; check each in the views and move it where needed. {found.note}"
+
+        return Task("Suggest landmarks", suggest, take)
+
+    def suggestLandmarksBlocked(self):
+        """Why no landmarks can be suggested now."""
+        if not self._lacking("LandmarksCT"):
+            return "the CT has landmarks already; remove them first"
+        return self._lacking("Bone", "OuterTable")
 
     # Registration
 
@@ -240,7 +288,7 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         wanted, landmarks = self.parameters().read(), self._landmarks()
         patient, planned, _ = self._pairs("LandmarksPatient", "LandmarksCT")
         surface, table = scene_data.get_surface("OuterTable"), scene.find("OuterTable")
-        promised = [table.GetAttribute(attribute) for attribute in SURFACE_ATTRIBUTES]
+        promised = [table.GetAttribute(attribute) for attribute in (POSITION_SD, OFFSET_SD)]
         known = dict(zip(("surface_sd_mm", "surface_offset_sd_mm"), map(float, promised))) if all(promised) else {}
         problem = RegistrationProblem(
             surface=surface,

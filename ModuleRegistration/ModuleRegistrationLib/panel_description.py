@@ -57,6 +57,7 @@ PANEL = Panel(
                 PluginField("segmentation", "Method", SEGMENTATIONS.kind),
                 Action("segmentBone", "Find bone", "Segment the skull; takes some seconds", primary=True),
                 NodeField("OuterTable", "Outer table"),
+                Action("findSkin", "Find skin", "The scalp's surface, for the views"),
                 ParameterField("marker_diameter_mm"),
                 Action("findMarkers", "Find spheres", "Centres of titanium spheres become the target points of the CT"),
             ),
@@ -69,6 +70,7 @@ PANEL = Panel(
             items=(
                 NodeField("LandmarksCT", "In the CT"),
                 NodeField("LandmarksPatient", "On the patient"),
+                Action("suggestLandmarks", "Suggest landmarks", "Propose landmarks on the skull; check and move each"),
                 ParameterField("landmark_fle_mm", "Usual error of a pair"),
                 Action("registerLandmarks", "Register landmarks", "First estimate of ReferenceToRas", primary=True),
                 ReadOut("fre", "FRE (RMS, not an accuracy)", "mm"),

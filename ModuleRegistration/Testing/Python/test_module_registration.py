@@ -178,3 +178,21 @@ def test_an_unknown_method_is_refused_with_those_that_are_installed(a_patient):
     a_patient.parameters().change(method="magic")
     with pytest.raises(InputError, match=r"unknown registration 'magic'; installed: .*icp"):
         a_patient.registerSurface()
+
+
+@pytest.mark.slow
+def test_a_real_head_is_segmented_and_its_landmarks_are_suggested(a_logic):
+    from CranioNavLib.sample_head import load_sample_head
+
+    assert a_logic.suggestLandmarksBlocked() == "Bone, OuterTable still missing"
+    a_logic.takeCt(load_sample_head())
+    a_logic.segmentBone().run()
+    a_logic.findSkin().run()
+    skin = scene_data.get_surface("Skin")
+    bone = scene_data.get_surface("OuterTable")
+    assert skin.signed_distance(bone.vertices_mm[::50]).max() < 1.0, "bone lies under the skin"
+    a_logic.suggestLandmarks().run()
+    landmarks = scene_data.get_points("LandmarksCT")
+    assert len(landmarks) == 4
+    assert bone.closest(landmarks.positions_mm).distances_mm.max() < 15.0
+    assert "has landmarks already" in a_logic.suggestLandmarksBlocked()
