@@ -32,12 +32,12 @@ def choose_head(ct: Optional[Path]) -> tuple[Optional[Volume], str]:
 
 def make_case(volume: Optional[Volume], seed: int, folder: Path, mode: str = "III") -> Path:
     """A case folder of a simulated session: every draw follows from `seed`."""
-    from CranioNavLib.phantom import make_patient
     from CranioNavLib.phantom.case_writer import write_case
     from ModuleRegistrationLib.anatomy.segmentation import segment_bone
+    from ModuleRegistrationLib.verification.simulated_patient import simulated_patient
     from ModuleUltrasoundLib.protocol import plan_protocol
 
-    patient = make_patient(volume, seed)
+    patient = simulated_patient(volume, seed)
     bone = segment_bone(patient.planning_ct)
     plan = plan_protocol(bone.outer_table, patient.landmarks_ras_mm, patient.landmark_labels)
     rng = np.random.default_rng([seed, 1])  # the session's own stream, apart from the patient's

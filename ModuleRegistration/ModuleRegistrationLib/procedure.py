@@ -24,7 +24,7 @@ from ModuleRegistrationLib.registration.error_theory import PredictedTre, predic
 from ModuleRegistrationLib.registration.landmarks import LandmarkRegistration, register_landmarks
 from ModuleRegistrationLib.registration.pairing import pair_points
 from ModuleRegistrationLib.registration.problem import METHODS, RegistrationProblem, RegistrationResult
-from ModuleRegistrationLib.registration.verdict import Verdict, judge
+from ModuleRegistrationLib.registration.verdict import Limits, Verdict, judge
 from ModuleRegistrationLib.verification.plausibility import Plausibility, plausibility
 from ModuleRegistrationLib.verification.tre import TargetErrors, target_errors
 
@@ -37,6 +37,8 @@ STYLUS_POINT_SD_MM = 0.5  # per axis: tracker 0.25 mm, tip calibration, and the 
 # Bone screws and skin markers: Maurer et al., IEEE TMI 16(4), 1997; landmarks: the chapter's mode IIa, whose
 # TRE of 2.78 mm with four landmarks needs about 3.5 mm.
 USUAL_FLE_MM = {"Ia": 0.7, "Ib": 2.0, "IIa": 3.5, "IIb": 3.5, "III": 3.5}
+# Landmarks alone are a start, not a result to navigate by: their error is told in a warning, and refused only beyond use
+LANDMARKS_ALONE = Limits(refuse_p95_mm=20.0)
 DEFAULT_TARGETS = 12  # spread over the outer table, where a case names no targets
 
 
@@ -112,7 +114,7 @@ def register_case(
     say("verifying", 0.9)
     targets, target_labels = _targets(case, bone)
     predicted = predict_tre_of(registration, targets) if registration.covariance is not None else None
-    verdict = judge(problem, registration, targets)
+    verdict = judge(problem, registration, targets, LANDMARKS_ALONE if mode in LANDMARK_MODES else None)
     return CaseResult(
         case=case,
         mode=mode,

@@ -27,6 +27,7 @@ def study(
     from CranioNavLib.phantom import MODES
     from ModuleRegistrationLib.registration.problem import METHODS
     from ModuleRegistrationLib.verification.studies import run_study, summarise, write_table
+    from ModuleRegistrationLib.verification.study_figure import write_figure
 
     from Workstation.demo_case import choose_head
     from Workstation.terminal import number, print_json, print_table, progress_bar
@@ -49,8 +50,9 @@ def study(
             progress=lambda done, all_of_them: say(f"trial {done} of {all_of_them}", done / all_of_them),
         )
     summaries = summarise(rows)
-    write_table(rows, folder / "trials.csv")
-    write_table(summaries, folder / "summary.csv")
+    write_table(folder / "trials.csv", rows)
+    write_table(folder / "summary.csv", summaries)
+    write_figure(folder / "study.png", rows)
     if json:
         print_json([asdict(summary) for summary in summaries])
         return

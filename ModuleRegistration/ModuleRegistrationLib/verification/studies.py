@@ -20,7 +20,7 @@ import numpy as np
 from CranioNavLib.bone_points import BonePoints
 from CranioNavLib.errors import InputError
 from CranioNavLib.files import written_whole
-from CranioNavLib.phantom import MODES, VirtualPatient, make_patient
+from CranioNavLib.phantom import MODES, VirtualPatient
 from CranioNavLib.phantom.session_data import SessionData, draw_session
 from CranioNavLib.rigid import Array
 from CranioNavLib.volume import Volume
@@ -31,6 +31,7 @@ from ModuleRegistrationLib.registration.landmarks import LandmarkRegistration, r
 from ModuleRegistrationLib.registration.problem import METHODS, RegistrationProblem, RegistrationResult
 from ModuleRegistrationLib.registration.verdict import judge
 from ModuleRegistrationLib.verification.plausibility import plausibility
+from ModuleRegistrationLib.verification.simulated_patient import simulated_patient
 from ModuleRegistrationLib.verification.tre import target_errors
 
 STUDIES = ("phantom", "cadaver", "patient")
@@ -149,7 +150,7 @@ def _batches(study: str, volume: Optional[Volume], seeds: Sequence[int], modes: 
 
 def run_seed(study: str, volume: Optional[Volume], seed: int, modes: Sequence[str], method: str) -> list[TrialRow]:
     """One simulated patient, registered in each mode."""
-    patient = make_patient(volume, seed, condition=study)
+    patient = simulated_patient(volume, seed, study)
     plan = _plan_for(volume)
     rows = []
     for mode in modes:
@@ -230,7 +231,7 @@ def _plan_for(volume: Optional[Volume]) -> _Plan:
     """Segmentation and palpation plan of the planning CT: the same for all patients of one head."""
     from ModuleUltrasoundLib.protocol import plan_protocol
 
-    patient = make_patient(volume, 0)
+    patient = simulated_patient(volume, 0)
     key = patient.bone.content_hash
     if key not in _PLANS:
         bone = segment_bone(patient.planning_ct)

@@ -199,6 +199,15 @@ def _scanned(volume: Volume, landmarks: Array, ct_seed: int) -> Scanned:
     return Scanned(volume, head, on_bone, *places, ct_seed=ct_seed)
 
 
+def knows_landmarks(volume: Volume) -> bool:
+    """Whether the landmarks of this CT are known without being told: it is the sample head."""
+    try:
+        _known_landmarks(volume)
+    except InputError:
+        return False
+    return True
+
+
 def _known_landmarks(volume: Volume) -> Array:
     """The landmarks of the sample head, wherever its volume was moved to."""
     import hashlib
