@@ -106,10 +106,10 @@ def _front_of(surface: Surface, frame: FaceFrame, right_mm: Array, up_mm: Array)
 
 
 def _profile_landmarks(closed: Surface, frame: FaceFrame, above_mm: float, below_mm: float) -> tuple[Array, Array]:
-    heights = np.arange(above_mm, -below_mm, -PROFILE_STEP_MM)
+    heights = np.arange(above_mm, -below_mm, -PROFILE_STEP_MM, dtype=np.float64)
     sides = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
     front = _front_of(closed, frame, np.tile(sides, len(heights)), np.repeat(heights, len(sides)))
-    profile = front.reshape(-1, len(sides)).max(axis=1)  # nasal bones may part in the midline
+    profile: Array = front.reshape(-1, len(sides)).max(axis=1)  # nasal bones may part in the midline
     tip = _end_of_nasal_bones(profile)
     brow = max(0, tip - int(75 / PROFILE_STEP_MM))
     part = slice(brow, tip + 1)
@@ -162,15 +162,16 @@ def _spine(profile: Array, tip: int, nasion: int) -> int:
 
 def _upright(frame: FaceFrame, nasion: Array, spine: Array) -> FaceFrame:
     """The face's axes with `up` from the spine to the nasion, which stand upright over each other in a level head."""
-    up = nasion - spine
-    up = up - (up @ frame.right) * frame.right
-    up /= np.linalg.norm(up)
-    return FaceFrame(nasion, frame.right, np.cross(up, frame.right), up)
+    away = nasion - spine
+    away = away - (away @ frame.right) * frame.right
+    up: Array = (away / np.linalg.norm(away)).astype(np.float64)
+    front: Array = np.cross(up, frame.right).astype(np.float64)
+    return FaceFrame(nasion, frame.right, front, up)
 
 
 def _lateral_rim(closed: Surface, frame: FaceFrame, side: float) -> Array:
     """The foremost bone beside the orbit, a little below the nasion; `side` is +1 on the right."""
-    across = np.arange(RIM_FROM_MM, RIM_TO_MM, 0.5)
+    across = np.arange(RIM_FROM_MM, RIM_TO_MM, 0.5, dtype=np.float64)
     front = _front_of(closed, frame, side * across, np.full(len(across), -SUTURE_BELOW_NASION_MM))
     if not np.isfinite(front).any() or front.max() < -60:
         raise InputError("landmarks: a lateral rim of the orbits is not in the CT; place the landmarks by hand")

@@ -43,9 +43,9 @@ def outer_table(mesh: BoneMesh, voxels: BoneVoxels, head: Head, barred: Mask) ->
         Hardly anything can be reached: the volume is no head, or shows too little of it.
     """
     reachable = reachable_vertices(mesh, voxels, head, barred)
-    kept = np.asarray(reachable[mesh.triangles].all(axis=1))
-    kept = _without_margins(mesh, kept)
-    triangles = _large_patches(mesh.points, mesh.triangles[kept])
+    triangles = mesh.triangles[_corners(reachable, mesh.triangles) > 0]  # the others share no corner with those kept
+    triangles = _without_margins(mesh.points, triangles, _corners(reachable, triangles) == 3)
+    triangles = _large_patches(mesh.points, triangles)
     if len(triangles) == 0:
         raise InputError("no part of the bone can be reached from the skin; the CT shows too little of the head's outside")
     return triangles
@@ -91,7 +91,8 @@ def _clear_of_bone(points: Floats, normals: Floats, towards: Floats, depth: Floa
     going = np.arange(len(points))
     for number in range(1, int(steps.max(initial=0)) + 1):
         place = np.rint(start + np.float32(number) * step).astype(np.int32)
-        within = (place >= 0).all(axis=1) & (place < (size_i, size_j, size_k)).all(axis=1)
+        within = (place[:, 0] >= 0) & (place[:, 1] >= 0) & (place[:, 2] >= 0)
+        within &= (place[:, 0] < size_i) & (place[:, 1] < size_j) & (place[:, 2] < size_k)
         place[~within] = 0  # the cut-out's border is air
         blocked = dense[(place[:, 2] * size_j + place[:, 1]) * size_i + place[:, 0]] >= voxels.threshold_hu
         clear[going[blocked]] = False
@@ -100,31 +101,46 @@ def _clear_of_bone(points: Floats, normals: Floats, towards: Floats, depth: Floa
     return clear
 
 
-def _without_margins(mesh: BoneMesh, kept: Mask) -> Mask:
-    """(T,) the kept triangles without those near the edge of an opening."""
+def _without_margins(points: Floats, triangles: Triangles, kept: Mask) -> Triangles:
+    """The kept ones of the triangles, without those near the edge of an opening."""
     from scipy.spatial import cKDTree
 
-    inside, outside = np.zeros(len(mesh.points), dtype=bool), np.zeros(len(mesh.points), dtype=bool)
-    inside[mesh.triangles[kept].ravel()] = True
-    outside[mesh.triangles[~kept].ravel()] = True
+    inside, outside = np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
+    inside[triangles[kept].ravel()] = True
+    outside[triangles[~kept].ravel()] = True
     edge = inside & outside
-    along = edge[mesh.triangles].sum(axis=1) >= 2
-    labels = patch_labels(len(mesh.points), mesh.triangles[along])
-    points, groups = mesh.points[edge], labels[edge]
-    spans = np.zeros(int(labels.max()) + 1)
+    openings = _long_edges(points, triangles[_corners(edge, triangles) >= 2], edge)
+    if len(openings) == 0:
+        return triangles[kept]
+    inner = np.flatnonzero(inside)
+    distance, _ = cKDTree(openings).query(points[inner], distance_upper_bound=MARGIN_MM)
+    near = np.zeros(len(points), dtype=bool)
+    near[inner[np.isfinite(distance)]] = True
+    result: Triangles = triangles[kept & (_corners(near, triangles) == 0)]
+    return result
+
+
+def _long_edges(points: Floats, along: Triangles, edge: Mask) -> Floats:
+    """The points of those edges, connected by the triangles `along`, whose extent is that of an opening."""
+    groups = patch_labels(len(points), along)[edge]
+    places = points[edge]
     order = np.argsort(groups, kind="stable")
     starts = np.flatnonzero(np.diff(groups[order], prepend=-1))
+    if len(starts) == 0:
+        return places
+    spans = np.zeros(int(groups.max()) + 1)
     for axis in range(3):
-        values = points[order, axis]
+        values = places[order, axis]
         spans[groups[order][starts]] += np.maximum.reduceat(values, starts) - np.minimum.reduceat(values, starts)
-    openings = points[spans[groups] >= OPENING_MM]
-    if len(openings) == 0:
-        return kept
-    inner = np.flatnonzero(inside)
-    distance, _ = cKDTree(openings).query(mesh.points[inner], distance_upper_bound=MARGIN_MM)
-    near = np.zeros(len(mesh.points), dtype=bool)
-    near[inner[np.isfinite(distance)]] = True
-    return np.asarray(kept & ~near[mesh.triangles].any(axis=1))
+    long: Floats = places[spans[groups] >= OPENING_MM]
+    return long
+
+
+def _corners(marked: Mask, triangles: Triangles) -> npt.NDArray[np.int8]:
+    """(T,) how many corners of each triangle are marked."""
+    flags = marked.view(np.int8)
+    count: npt.NDArray[np.int8] = flags[triangles[:, 0]] + flags[triangles[:, 1]] + flags[triangles[:, 2]]
+    return count
 
 
 def _large_patches(points: Floats, triangles: Triangles) -> Triangles:

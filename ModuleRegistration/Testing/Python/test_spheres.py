@@ -69,7 +69,7 @@ def a_head_with_places(a_sample_head):
     return resampled(a_sample_head, (2.0, 0.42, 0.42)), np.array(places)
 
 
-@pytest.mark.parametrize("metal_hu", [3500.0, 8000.0])
+@pytest.mark.parametrize("metal_hu", [pytest.param(3500.0, marks=pytest.mark.slow), 8000.0])
 def test_all_spheres_on_a_real_head_are_found_to_a_fifth_of_a_millimetre(a_head_with_places, metal_hu):
     head, places = a_head_with_places
     found = find_spheres(with_spheres(head, places, metal_hu=metal_hu))
