@@ -23,7 +23,8 @@ from ModuleTrackingLib.ndi.tracking_text import parse_tx
 
 OPTIONS = TRANSFORMS | TOOL_INFO | REPORT_OUT_OF_VOLUME
 FAILURES_FOR_LOSS = 3
-LOST_AFTER_S = 0.5  # damaged replies for this long, and at least three of them
+LOST_AFTER_S = 0.5  # nothing but failures for this long, and at least three of them
+LONGEST_SILENCE_S = 2.0  # without a frame from a device that otherwise answers
 WRAP = 2**32
 FRAMES_TO_LEARN, KEPT_FRAMES = 16, 60  # for the pace of frames
 LARGEST_LEAD = 0.95  # of the period: without any rest, where the line is the limit
@@ -135,11 +136,12 @@ class Poller:
                 self.counts.repeats += 1
                 yield Pause(self.clock.retry_s())
             except (SilenceError, DamagedReplyError, BadReplyError) as error:
-                failures += 1
                 self.trouble = str(error)
-                if failures >= FAILURES_FOR_LOSS and self.now() - self.last_good_s > LOST_AFTER_S:
+                heard = yield from self._clear_line(isinstance(error, SilenceError))
+                failures = 0 if heard else failures + (2 if isinstance(error, SilenceError) else 1)
+                silent_s = self.now() - self.last_good_s
+                if (failures >= FAILURES_FOR_LOSS and silent_s > LOST_AFTER_S) or silent_s > LONGEST_SILENCE_S:
                     raise DamagedReplyError(self.trouble) from None
-                yield from self._clear_line(isinstance(error, SilenceError))
 
     def _poll(self) -> Script[tuple[TrackingReply, float]]:
         self.counts.polls += 1
@@ -186,19 +188,22 @@ class Poller:
         """Whether no handle is there that could have a frame number."""
         return all(entry.frame is None for entry in reply.handles)
 
-    def _clear_line(self, silent: bool) -> Script[None]:
-        """Make sure that the next reply is the next command's.
+    def _clear_line(self, silent: bool) -> Script[bool]:
+        """Make sure that the next reply is the next command's; whether the device was heard meanwhile.
 
         After silence a late reply may still come and would be taken for the next one's. The fence's
         answer cannot be mistaken for it, and a device answers in order.
         """
-        if silent:
-            self.counts.silent += 1
-        else:
+        if not silent:
             self.counts.damaged += 1
+            yield Hush(0.005)
+            return False
+        self.counts.silent += 1
         yield Hush(0.005)
-        if silent:
-            try:
-                yield Ask(FENCE_COMMAND, FENCE_S, ReplyKind.FENCE)
-            except DeviceError:
-                return  # an error reply marks the place just as well
+        try:
+            yield Ask(FENCE_COMMAND, FENCE_S, ReplyKind.FENCE)
+        except SilenceError:
+            return False
+        except DeviceError:
+            return True  # an error reply marks the place just as well
+        return True

@@ -47,8 +47,8 @@ PROBE = "APIREV:"  # harmless in every mode; an error reply is an answer too
 RESET_TAKES_S = 7.0  # from break to the RESET message, at most
 LISTEN_FOR_RESET_S = 0.5
 BACK_OFF_S = (0.05, 0.1, 0.2, 0.3)  # between attempts to open a port that is gone
-FIRST_PATIENCE_S, LONGEST_PATIENCE_S = 1.0, 8.0
-SLOW_COMMANDS, QUICK_SHARE = ("INIT", "PINIT", "TSTART", "SET"), 0.3  # share of the patience that other commands get
+SLOW_S, QUICK_S = (1.0, 8.0), (0.3, 1.2)  # first and longest patience with slow commands and with the others
+SLOW_COMMANDS = ("INIT", "PINIT", "TSTART", "SET")
 ROUNDS_OF_PINIT = 3
 REPEATS = 8  # of a command whose answers come damaged
 LATE_S = 0.05
@@ -89,6 +89,25 @@ class Tool:
     info: PortInfo
 
 
+class Patience:
+    """How long an answer is waited for: short at first, longer after each silence, and as long as answers have taken."""
+
+    def __init__(self, first_s: float, longest_s: float) -> None:
+        self.first_s, self.longest_s, self.seconds, self._slowest_s = first_s, longest_s, first_s, 0.0
+
+    def grow(self) -> None:
+        """An answer did not come."""
+        self.seconds = min(self.longest_s, 2.0 * self.seconds)
+
+    def note(self, took_s: float) -> None:
+        """An answer came."""
+        self._slowest_s = max(self._slowest_s, took_s)
+
+    def settle(self) -> None:
+        """All is well: no more patience than answers need."""
+        self.seconds = max(self.first_s, min(self.longest_s, 2.0 * self._slowest_s))
+
+
 class Session:
     """State of one conversation. Its methods are scripts; whoever plays them needs nothing else.
 
@@ -118,8 +137,7 @@ class Session:
         self.firmware = ""
         self._connected = False
         self._speed_failures: dict[int, int] = {}
-        self._patience_s = FIRST_PATIENCE_S
-        self._slowest_s = 0.0
+        self._slow, self._quick = Patience(*SLOW_S), Patience(*QUICK_S)
         self._last_break_s = float("-inf")
 
     def forget_port(self) -> None:
@@ -144,7 +162,8 @@ class Session:
                 yield from self._initialise()
                 yield from self._raise_speed()
                 yield from self._set_up()
-                self._patience_s = max(FIRST_PATIENCE_S, 2.0 * self._slowest_s)
+                self._slow.settle()
+                self._quick.settle()
                 self.working_speed = self.speed
                 return
             except PortLostError as error:
@@ -400,13 +419,13 @@ class Session:
         Some commands take seconds, and a pulled cable must be noticed sooner. So patience is short at first;
         when it ends, a device that still answers a probe gets the command again, with more patience.
         """
+        patience = self._slow if command.startswith(SLOW_COMMANDS) else self._quick
         damaged = 0
         while True:
             asked_s = self.now()
             try:
-                share = 1.0 if command.startswith(SLOW_COMMANDS) else QUICK_SHARE
-                answer: Answer = yield Ask(command, share * self._patience_s + self._time_for(len(command) + 40))
-                self._slowest_s = max(self._slowest_s, (answer.at_s - asked_s) / share)
+                answer: Answer = yield Ask(command, patience.seconds + self._time_for(len(command) + 40))
+                patience.note(answer.at_s - asked_s)
                 return answer.data
             except DeviceError as error:
                 if error.code != 0x04 or not repeat:  # 04: the command was damaged on its way
@@ -418,7 +437,7 @@ class Session:
                     raise
                 self.say("setting up", f"{error}; asking again")
             except SilenceError as error:
-                self._patience_s = min(LONGEST_PATIENCE_S, 2.0 * self._patience_s)
+                patience.grow()
                 yield Hush()
                 if not repeat or not ((yield from self._answers()) or (yield from self._answers())):
                     raise

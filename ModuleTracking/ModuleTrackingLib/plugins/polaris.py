@@ -26,6 +26,7 @@ NO_NEWS_S = 0.2  # after this long without a good reply, tools are shown as miss
 LOST_SLICE_S = 0.05  # while the tracker is lost, `read` answers about this often
 LEAVE_S = 1.0  # at most this long is spent on saying good-bye
 ALERT_EVERY_S = 1.0
+ALERT_S = 0.05  # for the answer to what the alert is; tracking waits for it
 
 
 class Speed(str, Enum):
@@ -225,7 +226,7 @@ class PolarisTracker(Tracker):
         silent_s = now - poller.last_good_s
         patience_s = LOST_SLICE_S if silent_s >= NO_NEWS_S else NO_NEWS_S - silent_s
         if not conductor.advance(min(deadline_s, now + patience_s)):
-            if self.clock.now() - poller.last_good_s < NO_NEWS_S:
+            if self.clock.now() - poller.last_good_s < NO_NEWS_S - 1e-6:
                 return []
             return missing_poses(session.tools, self.clock.now(), "no answer", *([poller.trouble] if poller.trouble else []))
         reply, at_s = conductor.result
@@ -277,13 +278,15 @@ class PolarisTracker(Tracker):
     def _ask_for_alert(self) -> str:
         """What the tracker's alert is about, in words; asked by GET, which is allowed while tracking."""
         self._alert_asked_s = self.clock.now()
+        conductor, _ = self._opened
         bumped, alerts = "Param.Bump Detector.Bumped", "Info.Status.Alerts"
         found: dict[str, str] = {}
         for name in (bumped, alerts):
-            try:
-                found.update(self._play(_get(name), NO_NEWS_S))
-            except (LinkError, DeviceError, BadReplyError, TrackerError):
-                continue
+            with contextlib.suppress(LinkError, DeviceError, BadReplyError):  # asked again later
+                conductor.begin(_get(name))
+                if conductor.advance(self.clock.now() + 2 * ALERT_S):
+                    found.update(conductor.result)
+        conductor.drop()
         if found.get(bumped, "0") not in ("", "0"):
             return "the camera was bumped: check its accuracy"
         return f"alert {found[alerts]} of the tracker: see its manual" if alerts in found else ""
@@ -370,7 +373,7 @@ def _knock() -> Script[None]:
 
 
 def _get(name: str) -> Script[dict[str, str]]:
-    return parse_parameters((yield Ask(f"GET:{name}", NO_NEWS_S)).data)
+    return parse_parameters((yield Ask(f"GET:{name}", ALERT_S)).data)
 
 
 def _plan_of(settings: Any) -> Plan:

@@ -246,6 +246,15 @@ def test_device_time_goes_on_across_a_power_failure():
     assert max(b[0] - a[0] for a, b in zip(times, times[1:])) > 0.5
 
 
+def test_an_alert_whose_reason_is_lost_on_the_line_does_no_harm():
+    rig = Rig(faults=["bumped", "silence=0.03", "bit-errors=0.1"], seed=2)
+    good = 0
+    with rig.tracker:
+        for _ in range(300):
+            good += rig.check(rig.tracker.read()) == 4
+    assert good > 150
+
+
 def test_brown_outs_end_in_tracking_again():
     rig = Rig(faults=["brown-out:4"])
     with rig.tracker:
