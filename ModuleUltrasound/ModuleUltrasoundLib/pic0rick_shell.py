@@ -8,6 +8,7 @@ facts below were read from its sources and measured on its authors' recordings.
 from __future__ import annotations
 
 import re
+from collections import deque
 from dataclasses import dataclass
 from typing import Optional
 
@@ -125,15 +126,16 @@ class AlignedShot:
 def align_shot(
     codes: npt.NDArray[np.int64],
     acquisition: Acquisition,
-    use_forerun: bool,
+    flights: Optional[deque[float]],
     zero_after_bang: float,
     blind_us: float,
 ) -> AlignedShot:
     """Bring a shot to its own time zero.
 
-    With a forerun, the echo of its face is put where the acquisition says it belongs, 2 L / c after the pulse:
-    jitter, the converter's latency and the pulse's length cancel. Otherwise the onset of the transmit pulse
-    plus a calibrated constant is time zero.
+    Without a forerun, time zero is the onset of the transmit pulse plus a calibrated constant. With one, the sharp
+    echo of its face takes the place of the onset: `flights` collects the samples between the two over the last
+    shots (this one is added), and their median tells where the pulse was. So the onset's jitter cancels while
+    the delay line's own time, which its temperature changes, stays in the line for the measurement to see.
 
     Raises
     ------
@@ -144,11 +146,12 @@ def align_shot(
     if bang is None:
         raise ValueError("no transmit pulse")
     zero = bang + zero_after_bang
-    if use_forerun:
+    if flights is not None:
         echo = forerun_echo(codes, bang, acquisition)
         if echo is None:
             raise ValueError("no forerun echo")
-        zero = echo - 2e-3 * acquisition.forerun_length_mm / acquisition.forerun_speed_m_s * acquisition.sampling_hz
+        flights.append(echo - bang)
+        zero = echo - float(np.median(flights)) + zero_after_bang
     start = max(JUNK_SAMPLES, round(zero))
     gate = codes[start + int(blind_us * 1e-6 * acquisition.sampling_hz) :]
     clipped = bool(((gate == 0) | (gate == CODE_MAX)).any())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from dataclasses import dataclass
 from enum import Enum
 from typing import Annotated, Optional
@@ -26,12 +27,13 @@ WRITE_S, SHOT_S, READ_S = 1.0, 4.0, 5.0  # a shot may take the converter's time-
 READ_ATTEMPTS = 4  # of one buffer: reading it again fires nothing
 LOUD, QUIET = 0.98, 0.25  # of full scale: gain goes down when an echo clips, up when its peak is below a quarter
 GAIN_STEP_DB = 3.0
+FLIGHTS = 50  # shots over which the forerun's flight time is averaged: seconds, in which its temperature stays
 
 
 class TimeZero(str, Enum):
     """How a line's time zero is found."""
 
-    FORERUN = "forerun"  # from the echo of the forerun's face, in every line
+    FORERUN = "forerun"  # from the echo of the forerun's face in every line: free of the pulse's jitter
     CONSTANT = "constant"  # a calibrated constant after the onset of the transmit pulse
 
 
@@ -68,6 +70,7 @@ class Pic0rick(LinkedDevice):
         self._sampling_hz = float("nan")
         self._code = shell.gain_code(self.settings.gain_db)
         self._sequence = 0
+        self._flights: deque[float] = deque(maxlen=FLIGHTS)
 
     @property
     def acquisition(self) -> Acquisition:
@@ -217,7 +220,8 @@ class Pic0rick(LinkedDevice):
     def _aligned(self, codes: npt.NDArray[np.int64]) -> Optional[shell.AlignedShot]:
         wanted = self.settings
         try:
-            return shell.align_shot(codes, self.acquisition, self._use_forerun, wanted.zero_after_bang, wanted.blind_us)
+            flights = self._flights if self._use_forerun else None
+            return shell.align_shot(codes, self.acquisition, flights, wanted.zero_after_bang, wanted.blind_us)
         except ValueError as error:
             self.counters[str(error)] += 1
             return None

@@ -138,6 +138,15 @@ def test_jitter_of_the_pulse_moves_no_echo():
         assert abs(int(np.argmax(line.samples[face - 60 : face + 60])) - 60) <= 1
 
 
+def test_a_warm_delay_line_stays_in_the_line_for_the_measurement_to_see():
+    """Its face echo comes later than the length and speed in the settings say, jitter or not."""
+    with served(a_board("bang-jitter")) as port:
+        settings = {**settings_for(port), "forerun_speed_m_s": "2380"}  # the lines are of 2340 m/s: 0.33 us later
+        with AMODE_DEVICES.create("pic0rick", **settings) as device:
+            taken = lines_of(device, 4)
+    assert all(distance_to_a_recorded_line(line.samples) < 12 for line in taken)
+
+
 def test_without_a_forerun_time_zero_is_the_constant_after_the_pulse():
     with served(a_board("bang-jitter")) as port, AMODE_DEVICES.create("pic0rick", port=port) as device:
         taken = lines_of(device, 4)
