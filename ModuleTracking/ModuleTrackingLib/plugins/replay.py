@@ -41,8 +41,8 @@ class ReplayTracker(Tracker):
         self._frames: list[list[PoseRow]] = []
         self._names: list[str] = []
         self._next = 0
-        self._played = 0
-        self._duration_s = 0.0
+        self._rounds = 0
+        self._duration_s = self._pause_s = 0.0
         self._begin_s = math.nan
 
     def open(self) -> None:
@@ -62,12 +62,12 @@ class ReplayTracker(Tracker):
             self._frames = recorded_frames(read_recording(path, require_probe=False), path)
         self._names = list(dict.fromkeys(row.tool for frame in self._frames for row in frame))
         times = [frame[0].timestamp_s for frame in self._frames]
-        pause = float(np.median(np.diff(times))) if len(times) > 1 else 1.0  # between the last frame and the first again
-        self._duration_s = times[-1] - times[0] + pause
+        self._pause_s = float(np.median(np.diff(times))) if len(times) > 1 else 1.0  # between the last frame and the first again
+        self._duration_s = times[-1] - times[0] + self._pause_s
 
     def start(self) -> None:
         """Begin at the first frame."""
-        self._next = self._played = 0
+        self._next = self._rounds = 0
         self._begin_s = time.monotonic()
 
     def read(self, timeout_s: float = 1.0) -> list[ToolPose]:
@@ -83,20 +83,23 @@ class ReplayTracker(Tracker):
         if self.finished:
             time.sleep(min(timeout_s, END_S))
             return []
-        if self._next >= len(self._frames):
-            self._next = 0
-        frame = self._frames[self._next]
+        again = self._next >= len(self._frames)
+        frame = self._frames[-1 if again else self._next]
         device_s = math.nan
         if self.settings.speed > 0:
             elapsed_s = frame[0].timestamp_s - self._frames[0][0].timestamp_s
-            elapsed_s += self._played // len(self._frames) * self._duration_s
+            elapsed_s += self._rounds * self._duration_s + (self._pause_s / 2 if again else 0)
             device_s = elapsed_s / self.settings.speed
             wait_s = self._begin_s + device_s - time.monotonic()
             if wait_s > 0:
                 time.sleep(min(wait_s, timeout_s))
             if wait_s > timeout_s:
                 return []
-        number, self._next, self._played = self._next, self._next + 1, self._played + 1
+        if again:
+            # The tools jump back to where they were: a frame without them keeps anybody from interpolating across.
+            self._next, self._rounds = 0, self._rounds + 1
+            return [self._missing(name, device_s, -1, ("the recording begins again",)) for name in self._names]
+        number, self._next = self._next, self._next + 1
         return self._poses(frame, number, device_s)
 
     def stop(self) -> None:
@@ -122,10 +125,14 @@ class ReplayTracker(Tracker):
         for name in self._names:
             row = rows.get(name)
             if row is None:
-                poses.append(ToolPose(name, None, PoseStatus.MISSING, now, device_s, number))
+                poses.append(self._missing(name, device_s, number))
             else:
                 poses.append(ToolPose(name, row.tool_to_tracker, row.status, now, device_s, number, row.error_mm))
         return poses
+
+    @staticmethod
+    def _missing(tool: str, device_s: float, number: int, flags: tuple[str, ...] = ()) -> ToolPose:
+        return ToolPose(tool, None, PoseStatus.MISSING, time.monotonic(), device_s, number, flags=flags)
 
 
 def recorded_frames(recording: Recording, path: Path) -> list[list[PoseRow]]:

@@ -77,9 +77,20 @@ def test_the_end_is_told_or_begins_again(a_table):
         assert all(frames)
         assert tracker.finished
         assert tracker.read() == tracker.read() == []
-    frames = replayed(a_table, 31, speed=100)
-    np.testing.assert_array_equal(frames[30][0].tool_to_tracker, frames[0][0].tool_to_tracker)
-    assert frames[30][0].device_time_s > frames[29][0].device_time_s
+
+
+@pytest.mark.parametrize("speed", [0, 100])
+def test_a_looped_recording_begins_again_after_a_frame_without_tools(a_table, speed):
+    frames = replayed(a_table, 63, speed=speed)
+    for again in (30, 61):
+        assert [pose.status for pose in frames[again]] == [PoseStatus.MISSING] * 2
+        assert frames[again][0].flags == ("the recording begins again",)
+    np.testing.assert_array_equal(frames[31][0].tool_to_tracker, frames[0][0].tool_to_tracker)
+    np.testing.assert_array_equal(frames[62][0].tool_to_tracker, frames[0][0].tool_to_tracker)
+    if speed:
+        times = [frame[0].device_time_s for frame in frames]
+        np.testing.assert_allclose(np.diff(times[:30]), 1 / 6000, atol=1e-6)
+        np.testing.assert_allclose(np.diff(times[29:32]), 1 / 12000, atol=1e-6)
 
 
 def test_a_recording_is_replayed_in_the_tracker_s_frame(tmp_path):

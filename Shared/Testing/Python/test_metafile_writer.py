@@ -178,10 +178,13 @@ def test_a_killed_process_loses_at_most_100_ms(tmp_path):
     )
     target = tmp_path / "k.igs.mha"
     process = subprocess.Popen([sys.executable, "-c", code, str(target)], stdout=subprocess.PIPE, text=True)
-    time.sleep(1.5)
+    journal, deadline = journal_of(target), time.monotonic() + 60
+    while not journal.exists() or journal.read_bytes().count(b"_Timestamp") < 40:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
     process.send_signal(signal.SIGKILL if os.name == "posix" else signal.SIGTERM)
     told = [int(line) for line in process.communicate()[0].split()]
-    assert len(told) > 20
+    assert len(told) > 30
     with pytest.raises(InputError, match="interrupted; recover it"):
         read_recording(target)
     assert SimpleITK.ReadImage(str(journal_of(target))).GetSize()[2] >= told[-1] - 1
