@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from importlib.util import spec_from_file_location
@@ -9,7 +10,17 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import pytest
+
 ROOT = Path(__file__).parent
+
+
+def pytest_configure(config: Any) -> None:
+    """Where nobody reads the list of skipped tests, a missing sample head is a failure."""
+    from CranioNavLib.sample_head import cached_sample_head
+
+    if os.environ.get("CI") and cached_sample_head() is None:
+        raise pytest.UsageError("the sample head is missing; run ./cranionav test, which fetches it")
 
 
 class _OnDemand(ModuleType):
