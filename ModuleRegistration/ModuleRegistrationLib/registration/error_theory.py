@@ -99,7 +99,8 @@ def length_statistics(covariances_mm2: npt.ArrayLike, degrees_of_freedom: Option
     total = np.asarray(variances.sum(axis=-1), dtype=np.float64)
     if degrees_of_freedom is not None:
         active = total**2 / np.maximum(np.sum(variances**2, axis=-1), 1e-300)  # 1 for a line, 3 for a sphere
-        p95 *= np.sqrt(active * stats.f.ppf(0.95, active, degrees_of_freedom) / stats.chi2.ppf(0.95, active))
+        widening = np.sqrt(active * stats.f.ppf(0.95, active, degrees_of_freedom) / stats.chi2.ppf(0.95, active))
+        p95 = np.asarray(p95 * widening, dtype=np.float64)
     return PredictedTre(mean, p95, np.sqrt(total))
 
 
@@ -121,7 +122,8 @@ def _length_tables() -> tuple[Any, Any]:
     """Splines of the mean length and its 95% quantile over (middle SD / largest, smallest SD / largest)."""
     ratios = np.linspace(0, 1, GRID)
     middle, small = (grid.ravel() for grid in np.meshgrid(ratios, ratios, indexing="ij"))
-    low, high = np.full(GRID * GRID, 1.5), np.full(GRID * GRID, 3.0)
+    low: Array = np.full(GRID * GRID, 1.5)
+    high: Array = np.full(GRID * GRID, 3.0)
     for _ in range(30):
         radius = (low + high) / 2
         below = _probability_within(radius, middle, small) < 0.95
@@ -136,13 +138,13 @@ def _probability_within(radius: Array, middle: Array, small: Array) -> Array:
     nodes, weights = np.polynomial.legendre.leggauss(40)
     angle = (nodes + 1) * np.pi / 4  # z1 = radius sin(angle): takes the square root's corner out
     turn = (np.arange(48) + 0.5) * np.pi / 2 / 48  # a quarter turn is enough, and the midpoint rule is exact for periods
-    radius = np.minimum(radius, 12.0)  # beyond, the probability is 1 in double precision
-    z = radius[:, None] * np.sin(angle)
-    rest = (radius[:, None] * np.cos(angle)) ** 2
+    reach = np.minimum(radius, 12.0)  # beyond, the probability is 1 in double precision
+    z = reach[:, None] * np.sin(angle)
+    rest = (reach[:, None] * np.cos(angle)) ** 2
     spread = (middle[:, None] * np.cos(turn)) ** 2 + (small[:, None] * np.sin(turn)) ** 2
     with np.errstate(divide="ignore", under="ignore"):
         inside = 1 - np.exp(-rest[:, :, None] / (2 * np.maximum(spread, 1e-12))[:, None, :]).mean(axis=2)
-    density = np.exp(-(z**2) / 2) * np.sqrt(2 / np.pi) * radius[:, None] * np.cos(angle)
+    density = np.exp(-(z**2) / 2) * np.sqrt(2 / np.pi) * reach[:, None] * np.cos(angle)
     probability: Array = np.sum(weights * np.pi / 4 * density * inside, axis=1)
     return probability
 

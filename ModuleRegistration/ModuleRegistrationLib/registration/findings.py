@@ -25,7 +25,7 @@ SCALE_FOUND, SCALE_SIGMAS = 0.01, 4.0
 MOVED_MM, MOVED_P = 1.0, 1e-3
 LEAST_PER_SIDE, MOST_SPLITS = 5, 40
 LANDMARK_FAR_MM = 15.0
-ONE_SIDED = 0.2  # of the skull's half width: points that stay beyond it see one side only
+ONE_SIDED = 0.2  # of the skull's half size: how far points must reach beyond its middle to see the other side
 SPHERE_MM = 0.8  # a sphere through the points that misses them by less is as good as the skull itself
 AXES = ("left-right", "front-back", "head-foot")
 
@@ -74,13 +74,11 @@ def find_one_sidedness(problem: RegistrationProblem, result: RegistrationResult)
     points = result.points_ras_mm[result.used]
     centre, half = problem.surface.center_mm, np.ptp(problem.surface.vertices_mm, axis=0) / 2
     place = (points - centre) / half
-    names = (("right", "left", "rotation about the front-back axis"), ("front", "back", "rotation about the left-right axis"))
     findings = []
-    for axis, (high, low, weak) in ((0, names[0]), (1, names[1])):
-        side = high if place[:, axis].min() > ONE_SIDED else low if place[:, axis].max() < -ONE_SIDED else ""
-        # the protocol's points are nearly all in front; only points that also reach neither temple are too few views
-        if side and (axis == 0 or np.ptp(place[:, 0]) < 2 * ONE_SIDED):
-            findings.append(Finding(WARNING, f"all points lie on the {side} side: {weak} is poorly held; add points opposite"))
+    side = "right" if place[:, 0].min() > -ONE_SIDED else "left" if place[:, 0].max() < ONE_SIDED else ""
+    if side:
+        text = f"all points lie on the {side} side: rotation about the front-back axis is poorly held; add points opposite"
+        findings.append(Finding(WARNING, text))
     if place[:, 2].min() > ONE_SIDED:
         text = (
             "all points lie on the vault: rotation about the head-foot axis is poorly held; add forehead and periorbital points"

@@ -1,0 +1,56 @@
+import numpy as np
+import pytest
+from CranioNavLib.rigid import invert_rigid, rigid_from_vector
+from ModuleRegistrationLib.registration.global_search import draw_starts, search
+from ModuleRegistrationLib.registration.likelihood import State, evaluate, prepare
+from ModuleRegistrationLib.registration.posterior import motion_vector
+
+
+def state_at(model, vector: np.ndarray) -> State:
+    motion = rigid_from_vector(vector[None, :3], vector[None, 3:6], model.pivot)
+    return State(motion, vector[None, 6], vector[None, 7], np.ones(1), np.full(1, 0.05))
+
+
+def test_the_design_is_the_derivative_of_the_residuals(a_case) -> None:
+    model = prepare(a_case(1, landmark_sd=0.5).problem)
+    found = evaluate(model, state_at(model, np.zeros(8)))
+    for k, size in enumerate([1e-4] * 3 + [1e-2] * 3 + [1e-2, 1e-3]):
+        step = np.zeros(8)
+        step[k] = size
+        ahead, behind = (evaluate(model, state_at(model, sign * step)).residuals[0] for sign in (1, -1))
+        slopes = (ahead - behind) / (2 * size)
+        assert np.median(np.abs(slopes - found.design[0, :, k])) < 0.03 * max(1.0, np.abs(found.design[0, :, k]).max())
+
+
+def test_many_poses_cost_what_each_costs_alone(a_case) -> None:
+    model = prepare(a_case(1).problem)
+    starts = draw_starts(model, 5, np.random.default_rng(0))
+    together = evaluate(model, starts).cost
+    alone = [evaluate(model, starts.take(np.array([k]))).cost[0] for k in range(5)]
+    assert together == pytest.approx(alone, rel=1e-6)
+
+
+def test_poor_landmarks_lose_their_weight_at_the_true_pose(a_case) -> None:
+    weights = []
+    for landmark_sd in (1.0, 8.0):
+        case = a_case(1, landmark_sd=landmark_sd)
+        model = prepare(case.problem)
+        truth = case.true_reference_to_ras @ invert_rigid(case.problem.initial_reference_to_ras)
+        state = State(truth[None], np.zeros(1), np.zeros(1), np.ones(1), np.full(1, 0.05))
+        weights.append(evaluate(model, state).landmark_weight[0])
+    assert weights[0] > 10 * weights[1]
+
+
+def test_the_search_finds_the_true_minimum_from_poor_landmarks(a_case) -> None:
+    found = 0
+    for seed in range(8):
+        case = a_case(seed, landmark_sd=6.9)
+        minima, _, _ = search(prepare(case.problem), np.random.default_rng(0))
+        found += case.tre(minima.motion[0] @ case.problem.initial_reference_to_ras).mean() < 3
+    assert found >= 7
+
+
+def test_a_motions_vector_is_the_inverse_of_the_motion() -> None:
+    rng = np.random.default_rng(3)
+    vectors, pivot = rng.normal(0, 0.5, (20, 6)), np.array([10.0, -40, 25])
+    assert np.allclose(motion_vector(rigid_from_vector(vectors[:, :3], vectors[:, 3:], pivot), pivot), vectors, atol=1e-9)
