@@ -19,7 +19,7 @@ from ModuleRegistrationLib.anatomy.segmentation import BoneSurfaces
 
 IN_MEMORY = 2  # surfaces of a skull take about 50 MB
 ON_DISK_BYTES = 1_000_000_000
-ALGORITHM = 1  # raised whenever a segmentation gives another result: older files are not used any more
+ALGORITHM = 2  # raised whenever a segmentation gives another result: older files are not used any more
 
 _memory: OrderedDict[str, BoneSurfaces] = OrderedDict()
 
