@@ -134,3 +134,13 @@ def _run(command: list[str], folder: Path) -> None:
             f"the sample head cannot be fetched: `{' '.join(command[:2])}` says: {said}; "
             f"if apt does not know the package, run `apt-get update` as root; {HOW_TO_GET}"
         )
+
+
+if __name__ == "__main__":  # what the set-up of a checkout calls
+    import sys
+
+    try:
+        print(f"sample head: {fetch_sample_head()}")
+    except InputError as missing:
+        print(f"cranionav: {missing}", file=sys.stderr)
+        sys.exit(2)
