@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from CranioNavLib.errors import InputError
-from CranioNavLib.recording import Acquisition, Recording
+from CranioNavLib.recording import Acquisition, Recording, journal_of
 from CranioNavLib.rigid import LARGEST_COORDINATE_MM, ORTHONORMAL_TOLERANCE, Array
 
 FRAME_FIELD = re.compile(r"seq_frame(\d+)_(\w+)", re.IGNORECASE)
@@ -123,9 +123,8 @@ def read_recording(path: str | Path, allow_truncated: bool = False, require_prob
 
 def _read_header(path: Path) -> _Header:
     if not path.is_file():
-        journal = path.with_name(path.name[: -len(".igs.mha")] + ".part.igs.mhd") if path.name.endswith(".igs.mha") else path
-        if journal.is_file():
-            raise InputError(f"{path}: the recording was interrupted; recover it from {journal.name} first")
+        if path.suffix == ".mha" and journal_of(path).is_file():
+            raise InputError(f"{path}: the recording was interrupted; recover it with `cranionav tracker recover {path.name}`")
         raise InputError(f"{path}: no such file; give the path of a recording (.igs.mha)")
     header = _Header(path, {}, {}, {}, {}, 0)
     with path.open("rb") as file:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from CranioNavLib.errors import InputError
 from CranioNavLib.files import written_whole
 from CranioNavLib.metafile_reader import is_transform
-from CranioNavLib.recording import Acquisition, Recording
+from CranioNavLib.recording import Acquisition, Recording, journal_of
 from CranioNavLib.rigid import Array
 
 PAD = 40  # PLUS pads DimSize to this width, so that it can be patched in place
@@ -129,13 +129,18 @@ class RecordingWriter:
             raise InputError(f"{self.path}: frame {self.count} has {size} samples, expected {self.samples}")
         fields = _frame_fields(self.count, timestamp_s, transforms, statuses or {}, palpation_point)
         # Order matters: pixels, then fields, then the count. A kill in between leaves a file that is still right.
-        if line is not None:
-            _write_at(self._raw, np.ascontiguousarray(line, dtype="<i2").tobytes(), self.count * 2 * self.samples)
-        _write_at(self._fields, fields + self._tail, self._end)
+        try:
+            if line is not None:
+                _write_at(self._raw, np.ascontiguousarray(line, dtype="<i2").tobytes(), self.count * 2 * self.samples)
+            _write_at(self._fields, fields + self._tail, self._end)
+            _write_at(self._fields, _dim_size(self.samples, self.count + 1), self._size_at)
+        except OSError as error:
+            raise InputError(
+                f"cannot go on writing {self.path}: {error.strerror}; {self.count} frames are safe, free space and record anew"
+            ) from None
         self._end += len(fields)
         self.count += 1
         self._last_time = timestamp_s
-        _write_at(self._fields, _dim_size(self.samples, self.count), self._size_at)
 
     def close(self) -> None:
         """Join the journal into the file; may be called twice. A recording without frames leaves no file."""
@@ -155,13 +160,6 @@ class RecordingWriter:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
-
-
-def journal_of(path: str | Path) -> Path:
-    """The field file of the journal that RecordingWriter keeps for the recording `path`."""
-    path = Path(path)
-    stem = re.sub(r"(\.igs|\.seq)?\.mha$", "", path.name)
-    return path.with_name(f"{stem}.part.igs.mhd")
 
 
 def recover(path: str | Path) -> int:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -36,3 +38,10 @@ class Recording:
 
     def __len__(self) -> int:
         return len(self.lines)
+
+
+def journal_of(path: str | Path) -> Path:
+    """The field file of the journal that RecordingWriter keeps for the recording `path`."""
+    path = Path(path)
+    stem = re.sub(r"(\.igs|\.seq)?\.mha$", "", path.name)
+    return path.with_name(f"{stem}.part.igs.mhd")

@@ -6,7 +6,7 @@ One RF line a frame (`DimSize = N 1 F`, MET_SHORT), with pose, status and time a
 from __future__ import annotations
 
 from CranioNavLib.metafile_reader import read_recording
-from CranioNavLib.metafile_writer import RecordingWriter, journal_of, recover, write_recording
-from CranioNavLib.recording import Acquisition, Recording
+from CranioNavLib.metafile_writer import RecordingWriter, recover, write_recording
+from CranioNavLib.recording import Acquisition, Recording, journal_of
 
 __all__ = ["Acquisition", "Recording", "RecordingWriter", "journal_of", "read_recording", "recover", "write_recording"]

@@ -225,6 +225,23 @@ def test_an_interrupted_recording_is_not_overwritten(tmp_path):
         RecordingWriter(tmp_path / "a.igs.mha")
 
 
+@pytest.mark.skipif(not hasattr(os, "pwrite"), reason="fills the disk by a stand-in for pwrite")
+def test_a_full_disk_is_told_and_what_was_written_is_safe(tmp_path, monkeypatch):
+    recording = a_recording(6)
+    writer = RecordingWriter(tmp_path / "a.igs.mha", 64, ACQUISITION, recording.fields)
+    feed(writer, recording)
+
+    def full(*_: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "pwrite", full)
+        with pytest.raises(InputError, match="No space left on device; 6 frames are safe"):
+            writer.append(99.0, {"ProbeToReference": np.eye(4)}, line=recording.lines[0])
+    writer.close()
+    assert_same(read_recording(tmp_path / "a.igs.mha"), recording)
+
+
 def test_nothing_to_recover_is_told(tmp_path):
     with pytest.raises(InputError, match="nothing to recover"):
         recover(tmp_path / "a.igs.mha")
