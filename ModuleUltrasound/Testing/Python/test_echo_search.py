@@ -1,0 +1,53 @@
+import numpy as np
+import pytest
+from CranioNavLib.sequence_metafile import Acquisition, Recording
+from ModuleUltrasoundLib import echo_search
+from ModuleUltrasoundLib.echo_search import KEPT, search_lines
+from ModuleUltrasoundLib.echo_timing import BEFORE
+
+ACQUISITION = Acquisition(60e6, 5e6, 20.0, 2340.0)
+
+
+@pytest.fixture
+def a_recording():
+    rng = np.random.default_rng(0)
+    time = np.arange(2900) / ACQUISITION.sampling_hz
+    skin = 2e-3 * 20 / 2340
+    lines = rng.normal(0, 0.004, (60, 2900))
+    for at, height in (
+        (np.full(60, skin), 0.2),
+        (skin + rng.uniform(5e-6, 15e-6, 60), 0.5),
+        (skin + rng.uniform(2e-6, 4e-6, 60), 0.1),
+    ):
+        t = time - at[:, None]
+        lines += height * np.exp(-0.5 * (t * 5e6 / 0.5) ** 2) * np.cos(2 * np.pi * 5e6 * t)
+    return Recording(
+        np.round(8000 * lines).astype(np.int16), ACQUISITION, np.tile(np.eye(4), (60, 1, 1)), ("OK",) * 60, np.arange(60) / 50,
+        np.full(60, -1),
+    )  # fmt: skip
+
+
+def test_batches_do_not_change_what_is_found(a_recording, monkeypatch):
+    whole = search_lines(a_recording, 1540.0, (1.4, 20.0), several_spots=False)
+    monkeypatch.setattr(echo_search, "CHUNK", 7)
+    parts = search_lines(a_recording, 1540.0, (1.4, 20.0), several_spots=False)
+    assert parts.depths_mm[:, 0] == pytest.approx(whole.depths_mm[:, 0], abs=5e-3)
+
+
+def test_candidates_stand_in_the_order_of_their_rank(a_recording):
+    found = search_lines(a_recording, 1540.0, (1.4, 20.0), False, rank=lambda features: features[..., 0])
+    snr = found.candidates.snrs_db
+    assert (np.diff(np.nan_to_num(snr, nan=-99), axis=1) <= 1e-6).all()
+    assert found.features[..., 0][:, 0] * 20 == pytest.approx(snr[:, 0], abs=1e-3)
+
+
+def test_windows_are_cut_around_the_first_candidates(a_recording):
+    found = search_lines(a_recording, 1540.0, (1.4, 20.0), False, rank=lambda features: features[..., 0])
+    assert found.windows.shape[:2] == (60, KEPT)
+    middle = np.abs(found.windows[:, 0, BEFORE])
+    assert middle == pytest.approx(found.candidates.amplitudes[:, 0], rel=0.05)
+
+
+def test_depth_is_half_the_way_of_the_sound(a_recording):
+    slow = search_lines(a_recording, 1500.0, (1.4, 20.0), False)
+    assert slow.depths_mm == pytest.approx(slow.candidates.delays_s * 750e3, nan_ok=True)
