@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Optional
+from dataclasses import dataclass
 
 from ModuleTrackingLib.ndi import words
+from ModuleTrackingLib.ndi.plan import Plan, ToolFile
 from ModuleTrackingLib.ndi.replies import (
     PHINF_OPTIONS,
     SPEED_CODES,
@@ -23,13 +22,11 @@ from ModuleTrackingLib.ndi.replies import (
     rom_chunks,
 )
 from ModuleTrackingLib.ndi.steps import (
-    Answer,
     Ask,
     Break,
     Connect,
     DamagedReplyError,
     Disconnect,
-    Hush,
     LinkError,
     Pause,
     PortLostError,
@@ -38,46 +35,19 @@ from ModuleTrackingLib.ndi.steps import (
     SilenceError,
     SpeedError,
 )
+from ModuleTrackingLib.ndi.talk import POWER_ON_SPEED, Talk
 
-POWER_ON_SPEED = 9600
 NETWORK_SPEED = 10_000_000  # bits a second, for time-outs only
 SETTLE_S = 0.1  # after INIT and after a change of speed
-PROBE_S = 0.25  # a device that is there answers PROBE long before
-PROBE = "APIREV:"  # harmless in every mode; an error reply is an answer too
 RESET_TAKES_S = 7.0  # from break to the RESET message, at most
 LISTEN_FOR_RESET_S = 0.5
 BACK_OFF_S = (0.05, 0.1, 0.2, 0.3)  # between attempts to open a port that is gone
-SLOW_S, QUICK_S = (1.0, 8.0), (0.3, 1.2)  # first and longest patience with slow commands and with the others
-SLOW_COMMANDS = ("INIT", "PINIT", "TSTART", "SET")
 ROUNDS_OF_PINIT = 3
-REPEATS = 8  # of a command whose answers come damaged
-LATE_S = 0.05
 NO_SUCH_HANDLE = (0x08, 0x2B)
-_REVISION = re.compile(rb"[A-Z]\.\d{3}\.\d{3}")
 
 
 class SetUpError(Exception):
     """The set-up cannot succeed until the user changes something; the message says what."""
-
-
-@dataclass(frozen=True)
-class ToolFile:
-    """A tool whose description (.rom file) is uploaded."""
-
-    name: str
-    rom: bytes
-    source: str  # the file's name, for messages
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What the user wants of the set-up."""
-
-    tool_files: tuple[ToolFile, ...] = ()
-    names: dict[str, str] = field(default_factory=dict)  # part or serial number -> tool name, for wired tools
-    highest_speed: int = 1228739
-    volume: Optional[int] = None
-    counter_hz: Optional[float] = None  # ticks of the frame counter a second; None: ask the device
 
 
 @dataclass(frozen=True)
@@ -89,36 +59,17 @@ class Tool:
     info: PortInfo
 
 
-class Patience:
-    """How long an answer is waited for: short at first, longer after each silence, and as long as answers have taken."""
-
-    def __init__(self, first_s: float, longest_s: float) -> None:
-        self.first_s, self.longest_s, self.seconds, self._slowest_s = first_s, longest_s, first_s, 0.0
-
-    def grow(self) -> None:
-        """An answer did not come."""
-        self.seconds = min(self.longest_s, 2.0 * self.seconds)
-
-    def note(self, took_s: float) -> None:
-        """An answer came."""
-        self._slowest_s = max(self._slowest_s, took_s)
-
-    def settle(self) -> None:
-        """All is well: no more patience than answers need."""
-        self.seconds = max(self.first_s, min(self.longest_s, 2.0 * self._slowest_s))
-
-
-class Session:
+class Session(Talk):
     """State of one conversation. Its methods are scripts; whoever plays them needs nothing else.
 
     Parameters
     ----------
-    say : callable
-        Told in words what is going on: ("connecting" or "setting up", what).
+    plan : Plan
+        What the user wants.
+    now, say : callable
+        See Talk.
     has_speeds, has_break : callable
         What the present port can do.
-    now : callable
-        Monotonic seconds.
     """
 
     def __init__(
@@ -129,15 +80,14 @@ class Session:
         has_break: Callable[[], bool],
         say: Callable[[str, str], None] = lambda state, what: None,
     ) -> None:
-        self.plan, self.now, self.has_speeds, self.has_break, self.say = plan, now, has_speeds, has_break, say
+        super().__init__(now, say)
+        self.plan, self.has_speeds, self.has_break = plan, has_speeds, has_break
         self.tools: tuple[Tool, ...] = ()
-        self.speed = POWER_ON_SPEED
         self.working_speed = 0  # the last speed at which the set-up succeeded
         self.counter_hz = plan.counter_hz or 60.0
         self.firmware = ""
         self._connected = False
         self._speed_failures: dict[int, int] = {}
-        self._slow, self._quick = Patience(*SLOW_S), Patience(*QUICK_S)
         self._last_break_s = float("-inf")
 
     def forget_port(self) -> None:
@@ -229,6 +179,7 @@ class Session:
                 except SpeedError:
                     continue
                 if (yield from self._answers()):
+                    self._last_break_s = float("-inf")
                     return
             if self.has_break() and self.now() - self._last_break_s > RESET_TAKES_S:
                 yield from self._send_break()
@@ -243,20 +194,6 @@ class Session:
             yield Ask("", LISTEN_FOR_RESET_S)
         except (SilenceError, DamagedReplyError):
             return  # it may take seconds: the search goes on meanwhile
-
-    def _answers(self) -> Script[bool]:
-        """Whether a device answers at the present speed."""
-        try:
-            answer: Answer = yield Ask(PROBE, PROBE_S)
-            if not _REVISION.fullmatch(answer.data):
-                yield Hush(LATE_S)  # RESET, or an earlier command's answer: the probe's own is still to come
-        except DeviceError:
-            pass
-        except (SilenceError, DamagedReplyError):
-            yield Hush()
-            return False
-        self._last_break_s = float("-inf")
-        return True
 
     def _initialise(self) -> Script[None]:
         self.say("setting up", "initialising")
@@ -403,49 +340,6 @@ class Session:
     def line(self) -> str:
         """The line in words."""
         return f"{self.speed} baud" if self.has_speeds() else "the network's speed"
-
-    # -- one command ---------------------------------------------------------------------------
-
-    def _okay(self, command: str) -> Script[None]:
-        payload = yield from self._tell(command)
-        try:
-            check_okay(payload)
-        except BadReplyError as problem:
-            raise DamagedReplyError(str(problem)) from None
-
-    def _tell(self, command: str, repeat: bool = True) -> Script[bytes]:
-        """The reply to a command of the set-up.
-
-        Some commands take seconds, and a pulled cable must be noticed sooner. So patience is short at first;
-        when it ends, a device that still answers a probe gets the command again, with more patience.
-        """
-        patience = self._slow if command.startswith(SLOW_COMMANDS) else self._quick
-        damaged = 0
-        while True:
-            asked_s = self.now()
-            try:
-                answer: Answer = yield Ask(command, patience.seconds + self._time_for(len(command) + 40))
-                patience.note(answer.at_s - asked_s)
-                return answer.data
-            except DeviceError as error:
-                if error.code != 0x04 or not repeat:  # 04: the command was damaged on its way
-                    raise
-            except DamagedReplyError as error:
-                damaged += 1
-                yield Hush()
-                if not repeat or damaged > REPEATS:
-                    raise
-                self.say("setting up", f"{error}; asking again")
-            except SilenceError as error:
-                patience.grow()
-                yield Hush()
-                if not repeat or not ((yield from self._answers()) or (yield from self._answers())):
-                    raise
-                self.say("setting up", f"{error}; asking again")
-
-    def _time_for(self, count: int) -> float:
-        """Time-out of a prompt reply: the bytes on the line four times over, and never under 0.2 s."""
-        return max(0.2, 4.0 * 10.0 * count / self.speed)
 
 
 def _number(text: str) -> float:

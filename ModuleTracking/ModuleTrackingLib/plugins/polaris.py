@@ -6,19 +6,19 @@ import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from pathlib import Path
 from typing import Annotated, Any, Optional
 
-from CranioNavLib.errors import InputError
 from CranioNavLib.parameters import Limits, Parameters
 
 from ModuleTrackingLib.ndi.conductor import Conductor, SystemClock
+from ModuleTrackingLib.ndi.plan import Plan, read_pairs, read_tool_files
 from ModuleTrackingLib.ndi.poll import Counts, Poller
 from ModuleTrackingLib.ndi.poses import missing_poses, tool_poses
-from ModuleTrackingLib.ndi.replies import ROM_BYTES, BadReplyError, DeviceError, parse_parameters
+from ModuleTrackingLib.ndi.replies import BadReplyError, DeviceError, parse_parameters
 from ModuleTrackingLib.ndi.serial_port import list_ports, open_port, same_device, tcp_address
-from ModuleTrackingLib.ndi.session import PROBE, PROBE_S, Plan, Session, SetUpError, ToolFile
+from ModuleTrackingLib.ndi.session import Session, SetUpError
 from ModuleTrackingLib.ndi.steps import Ask, Clock, Connect, Disconnect, LinkError, Pause, Port, PortLostError, Script
+from ModuleTrackingLib.ndi.talk import PROBE, PROBE_S
 from ModuleTrackingLib.ndi.words import DIAGNOSTIC_PENDING
 from ModuleTrackingLib.tracker import ToolInfo, ToolPose, Tracker, TrackerError
 
@@ -386,29 +386,7 @@ def _plan_of(settings: Any) -> Plan:
     """
     if settings.port.startswith("socket://"):
         tcp_address(settings.port)
-    files = []
-    for name, place in _pairs("roms", settings.roms).items():
-        try:
-            rom = Path(place).expanduser().read_bytes()
-        except OSError as error:
-            raise InputError(
-                f"roms: cannot read {place} of tool {name}: {error.strerror}; give the path of its .rom file"
-            ) from None
-        if not 0 < len(rom) <= ROM_BYTES:
-            raise InputError(f"roms: {place} of tool {name} has {len(rom)} bytes; a tool file has 1 to {ROM_BYTES}")
-        files.append(ToolFile(name, rom, place))
     highest = 1228739 if settings.baud is Speed.HIGHEST else int(settings.baud.value)
-    return Plan(tuple(files), _pairs("names", settings.names), highest, settings.volume, settings.frame_counter_hz)
-
-
-def _pairs(what: str, text: str) -> dict[str, str]:
-    """`a=b;c=d` as a dictionary."""
-    pairs: dict[str, str] = {}
-    for part in filter(None, (piece.strip() for piece in text.split(";"))):
-        key, sign, value = (piece.strip() for piece in part.partition("="))
-        if not (sign and key and value):
-            raise InputError(f"{what}: expected name=value;name=value, got {part!r}")
-        if key in pairs:
-            raise InputError(f"{what}: {key} stands there twice; keep one")
-        pairs[key] = value
-    return pairs
+    return Plan(
+        read_tool_files(settings.roms), read_pairs("names", settings.names), highest, settings.volume, settings.frame_counter_hz
+    )
