@@ -17,7 +17,8 @@ def test_table_has_the_contracts_columns_and_empty_cells_where_nothing_is_known(
         positions_mm=np.array([[1.0, -2.0, 3.0], [nan] * 3, [nan] * 3]), covariances_mm2=np.zeros((3, 3, 3)),
         beam_directions=np.zeros((3, 3)), qualities=np.array([0.99, 0.9, 0.0]), accepted=np.array([True, False, False]),
         reasons=("", "pose missing", "no echo"), alternative_depths_mm=np.empty((3, 0)),
-        alternative_probabilities=np.empty((3, 0)), skin_times_s=np.zeros(3), speed_of_sound_m_s=1540.0, speed_of_sound_sd_m_s=52.0,
+        alternative_probabilities=np.empty((3, 0)), skin_times_s=np.zeros(3),
+        speed_of_sound_m_s=1540.0, speed_of_sound_sd_m_s=52.0,
     )  # fmt: skip
     write_depths_csv(tmp_path / "depths.csv", recording, lines)
     text = (tmp_path / "depths.csv").read_text()
