@@ -8,6 +8,7 @@ class Settings(Parameters):
 from __future__ import annotations
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 from enum import Enum
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -81,8 +82,7 @@ class Parameters:
     @classmethod
     def describe(cls) -> tuple[ParameterInfo, ...]:
         """One ParameterInfo a field, in order."""
-        hints = get_type_hints(cls, include_extras=True)
-        return tuple(_describe_field(field, hints[field.name]) for field in dataclasses.fields(cls))
+        return _describe(cls)
 
     @classmethod
     def from_strings(cls: type[P], values: dict[str, str]) -> P:
@@ -107,6 +107,13 @@ class Parameters:
         return {
             name: value.value if isinstance(value, Enum) else str(value) for name, value in values.items() if value is not None
         }
+
+
+@functools.cache
+def _describe(kind: type[Parameters]) -> tuple[ParameterInfo, ...]:
+    """Kept for each class: live panels ask many times a second."""
+    hints = get_type_hints(kind, include_extras=True)
+    return tuple(_describe_field(field, hints[field.name]) for field in dataclasses.fields(kind))
 
 
 def _describe_field(field: dataclasses.Field[Any], hint: Any) -> ParameterInfo:
