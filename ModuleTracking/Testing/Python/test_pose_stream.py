@@ -211,3 +211,26 @@ def test_tools_reported_one_by_one_are_brought_to_one_time(a_tracker, a_stream, 
     np.testing.assert_allclose(
         a_stream.current_in_reference("Probe").tool_to_reference, invert_rigid(base) @ poses["Probe"], atol=1e-9
     )
+
+
+def test_four_tools_at_250_hz_reach_a_slow_display_without_a_dropped_frame(a_tracker):
+    tools = ("Probe", "Reference", "Stylus", "Sphere")
+    begin = time.monotonic()
+
+    def due(k: int):
+        time.sleep(max(begin + k / 250 - time.monotonic(), 0))
+        return [ok(tool, a_pose(1), time.monotonic(), device_s=k / 250) for tool in tools]
+
+    for k in range(500):
+        a_tracker.put(lambda k=k: due(k))
+    with PoseStream(a_tracker) as stream:
+        frames: list = []
+        deadline = time.monotonic() + 30
+        while len(frames) < 500:
+            frames += stream.poll()
+            assert time.monotonic() < deadline
+            time.sleep(0.05)  # a display at 20 frames a second
+        assert stream.state.dropped_frames == 0
+    times = [frame[0].device_time_s for frame in frames]
+    np.testing.assert_allclose(times, np.arange(500) / 250)
+    assert all(len(frame) == 4 for frame in frames)
