@@ -26,7 +26,7 @@ from CranioNavLib.panel_model import PanelModel  # noqa: E402
 from ModuleTrackingLib.panel_description import PANEL, PointList, Tool, TrackingParameters  # noqa: E402
 from ModuleTrackingLib.tracker import PoseStatus, TrackerError  # noqa: E402
 
-POLL_MS = 20
+POLL_MS = 5
 TIP_HISTORY = 4096  # tip positions kept a tool: half a minute at 120 Hz
 LEVELS = {PoseStatus.OK: Level.GOOD, PoseStatus.OUT_OF_VOLUME: Level.WARNING}
 

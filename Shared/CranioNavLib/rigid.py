@@ -5,6 +5,7 @@ A transform `a_to_b` is a 4x4 matrix that acts on column vectors: `p_b = a_to_b 
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,8 @@ def check_rigid(matrix: npt.ArrayLike, name: str = "transform") -> Array:
     array = np.array(matrix, dtype=float)
     if array.shape != (4, 4):
         raise InputError(f"expected {name} as a 4x4 matrix, got shape {array.shape}")
+    if _is_exactly_rigid(array):  # poses come hundreds of times a second
+        return array
     if not np.isfinite(array).all():
         raise InputError(f"{name} holds a value that is not a finite number")
     if not np.allclose(array[3], (0, 0, 0, 1), atol=1e-6):
@@ -69,6 +72,18 @@ def check_rigid(matrix: npt.ArrayLike, name: str = "transform") -> Array:
     array[:3, :3] = left @ right
     array[3] = (0, 0, 0, 1)
     return array
+
+
+def _is_exactly_rigid(matrix: Array) -> bool:
+    """Whether a 4x4 is rigid to rounding; False, too, for values that are not finite."""
+    if matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+        return False
+    a, b, c = rows = matrix[:3, :3].tolist()
+    det = a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+    squares = [sum(x * y for x, y in zip(one, other)) for one, other in ((a, a), (b, b), (c, c), (a, b), (a, c), (b, c))]
+    off = max(abs(value - wanted) for value, wanted in zip(squares, (1, 1, 1, 0, 0, 0)))
+    finite = all(map(math.isfinite, (*matrix[:3, 3].tolist(), *sum(rows, []))))
+    return bool(det > 0 and off < 1e-12 and finite)
 
 
 def rigid(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Array:
