@@ -42,6 +42,10 @@ STAND_OFF_MM = 40.0  # a probe comes in from here without touching bone
 LARGEST_STEP_MM = 2.5  # of the bone under the probe's body
 LARGEST_ROUGHNESS_MM = 0.45  # RMS from the plane through the bone under the body
 SMALLEST_SPACING_MM = 20.0
+NASION_CHORD_MM = 14  # half the chord over the dip between brow and nose
+NASION_DIP_MM = 2.0  # its least depth below that chord
+FACE_DEPTH_MM = 60.0  # from the foremost bone to the nasion, at most
+LARGEST_PROFILE_STEP_MM = 5.0  # a longer step is the rim of a hole
 ADULT_LENGTH_MM = 178.0  # nasion to opisthocranion, where the CT does not reach the back of the head
 NORMAL_SD_MM = 0.6  # of a bone point along the surface normal: one value for all, only ratios matter here
 HEAD_RADIUS_MM = 75.0
@@ -160,20 +164,41 @@ def _frame_from_landmarks(points: Array) -> Array:
 
 
 def _frame_from_shape(surface: Surface) -> Array:
-    """Axes of RAS, origin at the nasion as the midline profile shows it: the dip below the brow."""
+    """Axes of RAS, origin at the nasion as profiles near the midline show it: the dip between brow and nose."""
     low, high = surface.vertices_mm.min(axis=0), surface.vertices_mm.max(axis=0)
     middle_x = (low[0] + high[0]) / 2
-    heights = np.arange(high[2] - 60.0, max(low[2], high[2] - 135.0), -1.0)
-    origins = np.column_stack([np.full(len(heights), middle_x), np.full(len(heights), high[1] + 50.0), heights])
-    profile = high[1] + 50.0 - surface.cast(origins, np.array([0.0, -1.0, 0.0])).distances_mm
-    nasion = np.array([middle_x, high[1] - 8.0, high[2] - 100.0])  # adult mean, if the profile shows no dip
-    for k in range(8, len(heights) - 8):
-        above, below = profile[max(0, k - 15) : k], profile[k + 1 : k + 16]
-        in_front = profile[k] > high[1] - 45.0
-        if in_front and profile[k] <= profile[k - 8 : k + 9].min() and min(above.max(), below.max()) > profile[k] + 1.0:
-            nasion = np.array([middle_x, profile[k], heights[k]])
-            break
-    return rigid(np.eye(3), nasion)
+    heights = np.arange(high[2] - 45.0, max(low[2], high[2] - 150.0), -1.0)
+    found = []
+    for x in middle_x + np.arange(-24.0, 25.0, 4.0):  # a head that leans has its nose beside the middle
+        origins = np.column_stack([np.full(len(heights), x), np.full(len(heights), high[1] + 50.0), heights])
+        profile = high[1] + 50.0 - surface.cast(origins, np.array([0.0, -1.0, 0.0])).distances_mm
+        profile[profile < high[1] - FACE_DEPTH_MM] = np.nan  # seen through a hole: the far side
+        dip = _first_dip(profile)
+        if dip is not None:
+            found.append([x, profile[dip], heights[dip]])
+    if not found:  # no face: where an adult's would be
+        return rigid(np.eye(3), [middle_x, high[1] - 8.0, high[2] - 100.0])
+    places = np.array(found)
+    agreeing = places[np.abs(places[:, 2] - np.median(places[:, 2])) < NASION_CHORD_MM]
+    return rigid(np.eye(3), agreeing[np.argmax(agreeing[:, 1])])  # beside the nose the bone lies further back
+
+
+def _first_dip(profile: Array) -> Optional[int]:
+    """Index of the uppermost dip of a profile that runs downwards in steps of 1 mm; None if it has none.
+
+    Its depth is taken from the chord over it, which does not mind a nodding head. A hole in the bone is no dip.
+    """
+    reach = NASION_CHORD_MM
+    depths = np.full(len(profile), -np.inf)
+    for k in range(reach, len(profile) - reach):
+        piece = profile[k - reach : k + reach + 1]
+        if np.isfinite(piece).all() and np.abs(np.diff(piece)).max() < LARGEST_PROFILE_STEP_MM:
+            slant = piece[0] - piece[-1]
+            depths[k] = ((piece[0] + piece[-1]) / 2 - profile[k]) * 2 * reach / np.hypot(2 * reach, slant)
+    for k in range(reach, len(profile) - reach):  # further down come the dips below the nose
+        if depths[k] > NASION_DIP_MM and depths[k] >= depths[k - reach // 2 : k + reach // 2 + 1].max():
+            return k
+    return None
 
 
 def _middle(surface: Surface, head_to_ras: Array) -> tuple[Array, float]:

@@ -7,7 +7,7 @@ import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import invert_rigid, rigid_from_vector, transform_directions, transform_points
 from CranioNavLib.surface import Surface
-from ModuleUltrasoundLib.protocol import LANDMARK_LABELS, REGIONS, plan_protocol, probe_footprint
+from ModuleUltrasoundLib.protocol import LANDMARK_LABELS, REGIONS, _first_dip, plan_protocol, probe_footprint
 
 COUNTS = {"Left lateral": 3, "Right lateral": 3, "Frontal convexity": 4, "Forehead": 4, "Periorbital": 4}
 # Nasion at the origin of the head built below
@@ -99,6 +99,16 @@ def test_without_landmarks_the_shape_gives_a_plan_near_the_same(a_skull):
     assert len(plan) == 18
     assert np.linalg.norm(plan.head_to_ras[:3, 3]) < 25.0
     assert (plan.positions_ras_mm[[r == "Right lateral" for r in plan.regions], 0] > 40).all()
+
+
+def test_the_nasion_is_the_uppermost_dip_of_the_profile_and_no_hole():
+    z = np.arange(100.0)  # mm downwards
+    face = 80 - 0.004 * (z - 40) ** 2 - 5.0 * np.exp(-(((z - 60) / 5) ** 2)) - 6.0 * np.exp(-(((z - 85) / 5) ** 2))
+    assert _first_dip(face) == pytest.approx(60, abs=2)
+    assert _first_dip(face + 0.2 * z) == pytest.approx(60, abs=2)  # nodding by 11 degrees
+    holed = np.where((z > 25) & (z < 40), face - 30.0, face)
+    assert _first_dip(holed) == pytest.approx(60, abs=2)
+    assert _first_dip(80 - 0.004 * (z - 40) ** 2) is None
 
 
 def test_unknown_landmark_names_fall_back_on_the_shape(a_skull):
