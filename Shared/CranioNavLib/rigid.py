@@ -82,7 +82,7 @@ def _is_exactly_rigid(matrix: Array) -> bool:
     det = a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])
     squares = [sum(x * y for x, y in zip(one, other)) for one, other in ((a, a), (b, b), (c, c), (a, b), (a, c), (b, c))]
     off = max(abs(value - wanted) for value, wanted in zip(squares, (1, 1, 1, 0, 0, 0)))
-    finite = all(map(math.isfinite, (*matrix[:3, 3].tolist(), *a, *b, *c))))
+    finite = all(map(math.isfinite, (*matrix[:3, 3].tolist(), *a, *b, *c)))
     return bool(det > 0 and off < 1e-12 and finite)
 
 

@@ -7,7 +7,7 @@ import os
 
 import numpy as np
 import pytest
-import SimpleITK as sitk  # noqa: N813
+import SimpleITK as sitk
 from CranioNavLib import host, scene_data
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import rigid, rigid_from_vector, transform_points
