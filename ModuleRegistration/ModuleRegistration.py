@@ -70,6 +70,10 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
     parameterClass = RegistrationParameters
     sessionRole = "RegistrationSession"
 
+    def __init__(self, parent=None):
+        super().__init__(parent)
+        self.registered = None  # last surface registration: landmarks, result, verdict, predicted TRE
+
     # Loading
 
     def loadCt(self):
@@ -96,6 +100,7 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         registration = scene.find("ReferenceToRas")
         if registration is not None:
             registration.RemoveAttribute(scene.STATUS_ATTRIBUTE)
+            scene_data.set_motion_error(None, (0.0, 0.0, 0.0), None)
             scene_data.set_transform("ReferenceToRas", [[float(row == column) for column in range(4)] for row in range(4)])
         scene_data.set_volume("CT", volume)
         return f"{volume.description}: {' × '.join(str(size) for size in volume.hu.shape[::-1])} voxels"
@@ -247,7 +252,7 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         from ModuleRegistrationLib.result_tables import landmark_rows
 
         found = self._landmarks()
-        self._setResult(found.reference_to_ras, "landmarks", landmark_rows(found))
+        self._setResult(found.reference_to_ras, "landmarks", landmark_rows(found), found)
         return "; ".join([f"{len(found.labels)} landmark pairs, FRE {found.fre_mm:.2f} mm (RMS)", *found.warnings])
 
     def registerLandmarksBlocked(self):
@@ -309,7 +314,8 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         rows = {**landmark_rows(landmarks), **surface_rows(result, verdict, predicted)}
         refused = verdict.status == "refused"  # then the landmarks' registration stays, and is shown as no more than that
         matrix, status = (landmarks.reference_to_ras, "landmarks") if refused else (result.reference_to_ras, verdict.status)
-        self._setResult(matrix, status, rows)
+        self._setResult(matrix, status, rows, landmarks if refused else result)
+        self.registered = (landmarks, result, verdict, predicted)
         scene_data.set_table("Residuals", residual_columns(points, result))
         self._plotResiduals()
         if refused:
@@ -465,13 +471,15 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
         scene_data.set_table("Results", {QUANTITY: list(rows), VALUE: list(rows.values())})
 
-    def _setResult(self, matrix, status, rows):
+    def _setResult(self, matrix, status, rows, result):
         """A new registration: results of the one before do not stay beside it."""
+        self.registered = None
         for role in ("Residuals", "TargetErrors", "RegisteredPoints"):
             scene.release(role)
         self._writeRows(rows)
         node = scene.find_or_create("ReferenceToRas")
         node.SetAttribute(scene.STATUS_ATTRIBUTE, status)
+        scene_data.set_motion_error(result.covariance, result.pivot_ras_mm, result.degrees_of_freedom)
         scene_data.set_transform("ReferenceToRas", matrix)
 
     def _plotResiduals(self):

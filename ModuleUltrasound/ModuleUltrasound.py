@@ -384,6 +384,20 @@ class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
     # What the panel shows
 
+    def live(self):
+        """For a drawing of the last line: its samples, rate in Hz, and what was measured (LineMeasurements); None without one."""
+        if not self._latest or self._live is None or not len(self._live):
+            return None
+        return self._latest[-1].line.samples, self.stream.acquisition.sampling_hz, self._live
+
+    def guide(self):
+        """Where the probe stands to the current point (guidance.Guide); None without a registration or a live probe."""
+        return self._guide
+
+    def taken(self):
+        """Labels of the points taken in this recording."""
+        return [point.label for point in self._palpation.taken] if self._palpation is not None else []
+
     def connection(self):
         """Connected, or why not."""
         if self.stream is None:

@@ -7,6 +7,7 @@ hangs under ReferenceToRas.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from CranioNavLib.volume import Volume
 
 SPEED, SPEED_SD = "CranioNav.SpeedOfSoundMps", "CranioNav.SpeedOfSoundSdMps"
 POSE_STATUS, POSE_TIME = "CranioNav.PoseStatus", "CranioNav.PoseTimeS"  # on the transforms of tracked tools
+MOTION_ERROR = "CranioNav.MotionError"  # on ReferenceToRas: JSON of its covariance, pivot and degrees of freedom
 AXES = "xyz"
 
 
@@ -76,6 +78,27 @@ def get_transform(role: str) -> Array:
         There is no such node, or the user replaced its matrix by one that is not rigid.
     """
     return check_rigid(host.slicer_package().util.arrayFromTransformMatrix(_node(role)), f"{role} in the scene")
+
+
+def set_motion_error(covariance: npt.ArrayLike | None, pivot_ras_mm: npt.ArrayLike, degrees_of_freedom: float | None) -> None:
+    """Keep the error of ReferenceToRas with it: covariance (6, 6) of a small motion about the pivot; None: not known."""
+    host.check_thread()
+    node = scene.find_or_create("ReferenceToRas")
+    if covariance is None:
+        node.RemoveAttribute(MOTION_ERROR)
+        return
+    kept = [np.asarray(covariance, dtype=float).tolist(), np.asarray(pivot_ras_mm, dtype=float).tolist(), degrees_of_freedom]
+    node.SetAttribute(MOTION_ERROR, json.dumps(kept))
+
+
+def get_motion_error() -> tuple[Array, Array, float | None] | None:
+    """Covariance (6, 6), pivot (3,) and degrees of freedom of ReferenceToRas; None where its error is not known."""
+    node = scene.find("ReferenceToRas")
+    text = node.GetAttribute(MOTION_ERROR) if node is not None else None
+    if not text:
+        return None
+    covariance, pivot, freedom = json.loads(text)
+    return np.array(covariance), np.array(pivot), freedom
 
 
 def set_pose(role: str, matrix: npt.ArrayLike | None, status: str, host_time_s: float) -> Any:
