@@ -19,7 +19,7 @@ from ModuleUltrasoundLib.echo_search import Found, search_lines
 from ModuleUltrasoundLib.echo_timing import time_echoes
 from ModuleUltrasoundLib.echo_weights import SHARED, SINGLE
 from ModuleUltrasoundLib.measure_points import bone_points as bone_points
-from ModuleUltrasoundLib.quality import CLIPPED_SHARE, TOLERANCE_MM, clipped_share, quality_of, reasons_of, unstable
+from ModuleUltrasoundLib.quality import CLIPPED_SHARE, TOLERANCE_MM, choose, clipped_share, quality_of, reasons_of, unstable
 
 LEAST_ALTERNATIVE = 0.01  # less probable echoes are not handed on
 SAME_SPOT_MM = 5.0
@@ -94,7 +94,7 @@ def measure_lines(recording: Recording, settings: EchoSettings | None = None) ->
     )
     shared = shared_features(found, single.scores(found.features), runs)
     chance, _ = probabilities(both.scores(np.concatenate([found.features, shared], axis=-1)), np.isfinite(found.depths_mm))
-    best = chance.argmax(axis=1)
+    best = choose(found.depths_mm, chance)
     shift_s, sd_s = time_of(found, best, chance, recording.acquisition.transducer_hz)
     return assemble(recording, settings, found, chance, best, shift_s, sd_s, runs, shared)
 

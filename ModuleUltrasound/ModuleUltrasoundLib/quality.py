@@ -11,6 +11,7 @@ from scipy.special import erf
 Bools = npt.NDArray[np.bool_]
 
 TOLERANCE_MM = 0.5  # what "right" means
+GROUP_SHARE = 0.9  # groups nearly as likely as the likeliest one compete by their best echo
 CLIPPED_SHARE = 0.15  # of an echo's samples at the converter's end: beyond, its shape is lost
 QUIET_DB = 14.0  # the strongest of a line's candidates is below this over the noise: nothing is seen in it
 STRONG_FORERUN_DB = 5.0  # over the recording's median: nothing takes sound out of the forerun
@@ -20,6 +21,17 @@ UNSTABLE_MM = 1.0  # off the neighbours' median along the beam, while the probe 
 STILL_MM = 2.0  # the probe rests: its origin moved less than this over the neighbours
 REACH = 5  # neighbours on each side
 LEAST_NEIGHBOURS = 4
+
+
+def choose(depth_mm: Array, chance: Array) -> npt.NDArray[np.int64]:
+    """The candidate (n,) to take for the bone: the likeliest of the group, no wider than the tolerance, that is likeliest.
+
+    A rough bone under a tilted beam, or the end of the tissue's speckle at it, shows as several echoes side by side.
+    """
+    near = np.abs(depth_mm[:, :, None] - depth_mm[:, None, :]) < TOLERANCE_MM
+    together = (near * chance[:, None, :]).sum(axis=2)
+    best = together.max(axis=1, keepdims=True, initial=0.0)
+    return np.asarray(np.where(together > GROUP_SHARE * best, chance, -1.0).argmax(axis=1), dtype=np.int64)
 
 
 def quality_of(depth_mm: Array, best: npt.NDArray[np.int64], chance: Array, depth_sd_mm: Array) -> Array:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition, Recording
-from ModuleUltrasoundLib.quality import clipped_share, converter_limits, quality_of, reasons_of, unstable
+from ModuleUltrasoundLib.quality import choose, clipped_share, converter_limits, quality_of, reasons_of, unstable
 
 
 def a_recording(count=20, lines=None, statuses=None):
@@ -73,3 +73,9 @@ def reasons(**values):
 )
 def test_each_refusal_has_its_reason(values, reason):
     assert reasons(**values) == reason
+
+
+def test_echoes_side_by_side_count_together_when_the_bone_is_chosen():
+    depth = np.array([[3.1, 9.0, 3.3, 3.4], [3.1, 9.0, 6.0, np.nan]])
+    chance = np.array([[0.2, 0.35, 0.25, 0.15], [0.3, 0.35, 0.2, 0.0]])
+    assert choose(depth, chance).tolist() == [2, 1]
