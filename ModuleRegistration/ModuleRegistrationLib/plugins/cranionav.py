@@ -23,8 +23,8 @@ class MaximumLikelihood(SurfaceRegistration):
     class Settings(Parameters):
         """How thoroughly to search; accuracy hardly depends on it once the minimum is found."""
 
-        starts: Annotated[int, Limits(1, 2000), "poses drawn from the landmarks' uncertainty"] = 96
-        samples: Annotated[int, Limits(50, 20000), "posterior samples that mean and covariance come from"] = 500
+        starts: Annotated[int, Limits(1, 2000), "poses drawn from the landmarks' uncertainty"] = 72
+        samples: Annotated[int, Limits(50, 20000), "posterior samples that mean and covariance come from"] = 300
 
     def register(self, problem: RegistrationProblem) -> RegistrationResult:
         """See the base class."""

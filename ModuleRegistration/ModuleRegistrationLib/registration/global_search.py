@@ -44,13 +44,14 @@ def draw_starts(model: Model, count: int, rng: np.random.Generator) -> State:
 def search(model: Model, rng: np.random.Generator, stages: tuple[Stage, ...] = STAGES) -> tuple[State, Array, int]:
     """The distinct minima found, best first, their scores (negative log evidence) and the number of steps."""
     state = draw_starts(model, stages[0].keep, rng)
+    cost: Array = np.zeros(stages[0].keep)
     steps = 0
     for stage in stages:
-        if steps:
-            state = state.take(np.argsort(evaluate(model, state).cost)[: stage.keep])
+        state = state.take(np.argsort(cost, kind="stable")[: stage.keep])
         for largest in stage.scales:
-            state, _ = advance(model, state, evaluate(model, state), LONGEST_STEP_MM, largest)
-            steps += 1
+            found = evaluate(model, state)
+            state, _ = advance(model, state, found, LONGEST_STEP_MM, largest)
+            cost, steps = found.cost, steps + 1  # of the pose before the step: good enough to drop the poor ones
     found = evaluate(model, state)
     hessian, _ = normal_equations(model, state, found)
     score = found.cost + np.linalg.slogdet(hessian)[1] / 2

@@ -139,7 +139,7 @@ def evaluate(model: Model, state: State) -> Evaluation:
     variances = (back * (model.covariances @ back[..., None])[..., 0]).sum(axis=-1) + model.surface_variance
     slope = (normals * beams).sum(axis=-1)
     design = np.empty((count, number, PARAMETERS))
-    design[..., :3] = np.cross(points - model.pivot, normals)
+    design[..., :3] = _cross(points - model.pivot, normals)
     design[..., 3:6] = normals
     design[..., 6] = -1.0
     design[..., 7] = slope * model.depths
@@ -163,6 +163,13 @@ def evaluate(model: Model, state: State) -> Evaluation:
         landmark_misses=misses,
         landmark_design=motion_jacobian(moved, model.pivot),
     )
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Cross products along the last axis; several times faster than numpy's on small arrays."""
+    x, y, z = a[..., 0], a[..., 1], a[..., 2]
+    u, v, w = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
 
 
 def _prior_cost(model: Model, state: State) -> Array:
@@ -221,7 +228,7 @@ def advance(
     hessian, gradient = normal_equations(model, state, found)
     step = -np.linalg.solve(hessian, gradient[..., None])[..., 0]
     arm = model.points - model.pivot
-    shift = np.cross(step[:, None, :3], arm) + step[:, None, 3:6]
+    shift = _cross(step[:, None, :3], arm[None]) + step[:, None, 3:6]
     length = np.sqrt((shift**2).sum(axis=-1).mean(axis=1))
     step = step * np.minimum(1, longest_step_mm / np.maximum(length, 1e-12))[:, None]
     motion = rigid_from_vector(step[:, :3], step[:, 3:6], model.pivot) @ state.motion
