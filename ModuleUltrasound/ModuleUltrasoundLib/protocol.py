@@ -179,7 +179,8 @@ def _frame_from_shape(surface: Surface) -> Array:
     if not found:  # no face: where an adult's would be
         return rigid(np.eye(3), [middle_x, high[1] - 8.0, high[2] - 100.0])
     places = np.array(found)
-    agreeing = places[np.abs(places[:, 2] - np.median(places[:, 2])) < NASION_CHORD_MM]
+    middle = np.sort(places[:, 2])[len(places) // 2]  # one of them, not between two that differ
+    agreeing = places[np.abs(places[:, 2] - middle) < NASION_CHORD_MM]
     return rigid(np.eye(3), agreeing[np.argmax(agreeing[:, 1])])  # beside the nose the bone lies further back
 
 

@@ -160,3 +160,9 @@ def test_a_probe_cannot_stand_at_an_edge_or_on_a_step():
     _, normals, _, good = probe_footprint(plate, places, np.tile(leaning, (4, 1)))
     assert good.tolist() == [True, False, False, True]
     assert normals[0] == pytest.approx([0.0, 0.0, 1.0], abs=1e-4)
+
+
+def test_two_dips_that_disagree_still_give_a_nasion(a_skull, monkeypatch):
+    dips = iter([30, None, 80] + [None] * 50)
+    monkeypatch.setattr("ModuleUltrasoundLib.protocol._first_dip", lambda profile: next(dips))
+    assert np.isfinite(plan_protocol(a_skull).head_to_ras).all()
