@@ -33,6 +33,7 @@ def record(
     contact = np.ones(count, dtype=bool) if contact is None else contact
     bone = np.ones(count, dtype=bool) if bone is None else bone
     lines = np.zeros((count, samples))
+
     def add(line, at_s, height):
         first, last = (int((at_s + edge) * acquisition.sampling_hz) for edge in (-3 / centre, 12 / centre))
         first, last = max(first, 0), min(last, samples)
@@ -194,3 +195,12 @@ def test_stays_end_where_the_probe_jumps_or_the_point_changes():
     poses = recording.probe_to_reference.copy()
     poses[4, :3, 3] += 20
     assert stays(replace(recording, probe_to_reference=poses)).tolist() == [0, 0, 1, 1, 2, 3]
+
+
+@pytest.mark.parametrize("depth", [3.0, 9.0, 14.5])
+def test_scalp_of_one_depth_everywhere_is_no_artefact(depth):
+    rng = np.random.default_rng(13)
+    recording = record(rng, np.full(25, depth), SET_UPS["5 MHz, polystyrene"])
+    lines = measure_lines(recording, EchoSettings(speed_of_sound_m_s=SPEED))
+    assert lines.accepted.mean() > 0.9
+    assert np.abs(lines.depths_mm[lines.accepted] - depth).max() < 0.1
