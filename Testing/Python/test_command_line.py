@@ -10,7 +10,20 @@ import pytest
 
 from Workstation.__main__ import run
 
-LISTED = {"demo", "test", "surface", "markers", "register", "batch", "evaluate", "plausibility", "echo", "plugins", "selftest"}
+LISTED = {
+    "demo",
+    "test",
+    "surface",
+    "markers",
+    "register",
+    "batch",
+    "evaluate",
+    "plausibility",
+    "echo",
+    "plugins",
+    "selftest",
+    "workstation",
+}
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:

@@ -18,6 +18,7 @@ from Workstation.commands import (
     study,
     surface,
     tracker,
+    workstation,
 )
 from Workstation.commands import test as suite
 
@@ -42,3 +43,4 @@ app.add_typer(emulate.app, name="emulate")
 app.add_typer(tracker.app, name="tracker")
 app.command("selftest")(selftest.selftest)
 app.command("plugins")(plugins.plugins)
+app.command("workstation")(workstation.workstation)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import logging
+from pathlib import Path
 from typing import Any
 
 from CranioNavLib import host
@@ -14,42 +16,47 @@ from CranioNavLib.panel_model import PanelModel
 from trame.app import TrameApp
 
 from Workstation.web.background import BackgroundRunner
+from Workstation.web.drawings import drawings
 from Workstation.web.page import Page
 from Workstation.web.panel_view import PanelView
-from Workstation.web.procedure import PROCEDURE
+from Workstation.web.procedure import HAND, NAVIGATION, PROCEDURE, REGISTRATION, SESSION, TRACKING, ULTRASOUND
+from Workstation.web.session_folder import SessionFolder, new_folder
+from Workstation.web.session_panel import SessionLogic
 from Workstation.web.views import ViewFollower
 
 POLL_S = 0.04  # devices: at least 20 updates a second reach the views
 REFRESH_EVERY = 5  # polls between two looks at the read-outs
+SAVE_EVERY = 25  # polls between two looks at what is to be saved
+PICTURE_QUALITY = 85  # JPEG; one quality for moving and still pictures, so that none is sent twice
+LOG = logging.getLogger(__name__)
 
 
 class WorkstationApp(TrameApp):
     """Server side of the page. Everything that touches the scene runs in the event loop's thread."""
 
-    def __init__(self, server: Any = None) -> None:
+    def __init__(self, server: Any = None, folder: Path | None = None) -> None:
         super().__init__(server)
         from trame_slicer import module as slicer_views
-        from trame_slicer.core import LayoutManager, SlicerApp
-        from trame_slicer.rca_view import register_rca_factories
 
         self.server.enable_module(slicer_views)
         with host.quiet():
-            self.slicer = SlicerApp()
-            host.adopt_scene(self.slicer.scene, self.slicer.app_logic)
-            register_rca_factories(self.slicer.view_manager, self.server)
-            self.layouts = LayoutManager(self.slicer.scene, self.slicer.view_manager, self.server)
-            # the views are made here: made inside the page, their widgets would land between the page's own
-            self.layouts.register_layout_dict(LayoutManager.default_grid_configuration())
-            self.layouts.set_layout("Quad View")
+            self._make_views()
         self.runner = BackgroundRunner()
+        self.session = SessionFolder(folder or new_folder(), self._parameter_nodes)
+        self.logics: dict[str, Any] = {}
         self.panels: dict[str, PanelView] = {}
-        self._polled: list[Any] = []
-        for panel, logic in _modules():
+        for panel, logic in _modules(self.session, self.logics, self._go_to):
+            self.logics[panel.module] = logic
             key = panel.module.replace("Module", "").lower()
-            self.panels[panel.module] = PanelView(self.server, PanelModel(panel, logic, self.runner), key)
-            if hasattr(logic, "poll"):
-                self._polled.append(logic)
+            model = PanelModel(panel, logic, self.runner)
+            self.panels[panel.module] = PanelView(self.server, model, key, self.session.shown, self.session.meant)
+        self._use_folder()
         self.views = ViewFollower(self.slicer)
+        self.server.state.live, self.server.state.files, self.server.state.simulated = (
+            drawings(self.logics[ULTRASOUND]),
+            [],
+            False,
+        )
         self.page = Page(self.server, self.panels, self.layouts, PROCEDURE)
         self.server.controller.on_server_ready.add_task(self._keep_fresh)
 
@@ -58,34 +65,114 @@ class WorkstationApp(TrameApp):
         """The page's layout, as trame's tools expect it."""
         return self.page.layout
 
+    def open_case(self) -> None:
+        """Load the case that the session's folder holds already. In the event loop."""
+        panel = self.panels[REGISTRATION]
+        self.logics[REGISTRATION].parameters().change(case_folder=str(self.session.folder))
+        panel.model.run(next(action for action in panel.model.panel.actions() if action.name == "loadCase"))
+
+    def _make_views(self) -> None:
+        from trame_slicer.core import LayoutManager, SlicerApp
+        from trame_slicer.rca_view import register_rca_factories
+
+        from Workstation.web.pacing import pace
+
+        self.slicer = SlicerApp()
+        host.adopt_scene(self.slicer.scene, self.slicer.app_logic)
+        register_rca_factories(self.slicer.view_manager, self.server, interactive_quality=PICTURE_QUALITY)
+        self.layouts = LayoutManager(self.slicer.scene, self.slicer.view_manager, self.server)
+        # the views are made here: made inside the page, their widgets would land between the page's own
+        self.layouts.register_layout_dict(LayoutManager.default_grid_configuration())
+        self.layouts.set_layout("Quad View")
+        self.budget = pace(self.slicer.view_manager.get_views())
+
+    def _use_folder(self) -> None:
+        """The modules write into the session's folder unless the user says otherwise."""
+        self.logics[ULTRASOUND].parameters().change(recording_path=self.session.recording_path)
+        self.logics[REGISTRATION].parameters().change(output_folder=str(self.session.folder))
+
+    def _parameter_nodes(self) -> list[Any]:
+        kept = (REGISTRATION, TRACKING, ULTRASOUND, HAND, NAVIGATION)
+        return [self.logics[name].parameters().node for name in kept]
+
+    def _go_to(self, step: str) -> None:
+        self.server.state.step = step
+
     async def _keep_fresh(self, **_: Any) -> None:
         """Bring the devices' news into the scene, and the scene's into the panels."""
         for turn in itertools.count():
             await asyncio.sleep(POLL_S)
-            for logic in self._polled:
+            for name in (TRACKING, ULTRASOUND):
                 with contextlib.suppress(InputError):  # the logic keeps the reason and its panel shows it
-                    logic.poll()
-            if turn % REFRESH_EVERY == 0:
-                self.views.refresh()
-                for panel in self.panels.values():
-                    panel.refresh()
+                    self.logics[name].poll()
+            try:
+                self._turn(turn)
+            except Exception:  # a read-out's defect must not end tracking
+                LOG.exception("the page could not be brought up to date")
+
+    def _turn(self, turn: int) -> None:
+        if turn % 2 == 0 and self.server.state.step == "navigation":
+            self._navigate()
+        if turn % REFRESH_EVERY == 0:
+            self.views.refresh()
+            with self.server.state as state:
+                if state.step in ("devices", "ultrasound"):
+                    state.live = drawings(self.logics[ULTRASOUND])
+                state.files = self.logics[SESSION].offered()
+                state.simulated = self._is_simulated()
+            for panel in self.panels.values():
+                panel.refresh()
+        if turn % SAVE_EVERY == 0:
+            self._save()
+
+    def _navigate(self) -> None:
+        logic = self.logics[NAVIGATION]
+        wanted, found = logic.parameters().read(), logic.tip()
+        if found is not None and wanted.follow:
+            self.views.follow(found[1])
+        error = logic.error_mm(found[1]) if found is not None and wanted.ring else None
+        self.views.ring(found[1] if found is not None else None, error)
+
+    def _is_simulated(self) -> bool:
+        from CranioNavLib.phantom.session import running_session
+
+        if running_session() is None:
+            return False
+        if self.session.simulated_seed is None:
+            self.session.simulated_seed = self.logics[HAND].parameters().read().seed
+        return True
+
+    def _save(self) -> None:
+        try:
+            volume = self.session.ct_to_write()
+            if volume is not None:
+                self.runner.start(lambda: self.session.write_ct(volume), _raise_if_failed)
+            self.session.save(self.server.state.step)
+        except (InputError, OSError) as error:
+            LOG.error("the session cannot be saved: %s", error)
 
 
-def _modules() -> list[tuple[Panel, Any]]:
-    """Each module's panel with a logic on the host's scene."""
-    from ModuleRegistrationLib.panel_description import PANEL as REGISTRATION
-    from ModuleTrackingLib.panel_description import PANEL as TRACKING
-    from ModuleUltrasoundLib.panel_description import PANEL as ULTRASOUND
+def _raise_if_failed(outcome: Any) -> None:
+    if isinstance(outcome, BaseException):
+        raise outcome
+
+
+def _modules(session: SessionFolder, logics: dict[str, Any], go_to: Any) -> list[tuple[Panel, Any]]:
+    """Each panel with a logic on the host's scene."""
+    from ModuleRegistrationLib.panel_description import PANEL as REGISTRATION_PANEL
+    from ModuleTrackingLib.panel_description import PANEL as TRACKING_PANEL
+    from ModuleUltrasoundLib.panel_description import PANEL as ULTRASOUND_PANEL
 
     from ModuleRegistration import ModuleRegistrationLogic
     from ModuleTracking import ModuleTrackingLogic
     from ModuleUltrasound import ModuleUltrasoundLogic
-    from Workstation.web.simulated_hand import PANEL as HAND
-    from Workstation.web.simulated_hand import SimulatedHandLogic
+    from Workstation.web import navigation, session_panel, simulated_hand
 
     return [
-        (REGISTRATION, ModuleRegistrationLogic()),
-        (TRACKING, ModuleTrackingLogic()),
-        (ULTRASOUND, ModuleUltrasoundLogic()),
-        (HAND, SimulatedHandLogic()),
+        (REGISTRATION_PANEL, ModuleRegistrationLogic()),
+        (TRACKING_PANEL, ModuleTrackingLogic()),
+        (ULTRASOUND_PANEL, ModuleUltrasoundLogic()),
+        (simulated_hand.PANEL, simulated_hand.SimulatedHandLogic()),
+        (navigation.PANEL, navigation.NavigationLogic()),
+        (session_panel.PANEL, SessionLogic(session, logics, go_to)),
     ]

@@ -8,8 +8,10 @@ from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import client, html
 from trame.widgets import vuetify3 as v3
 
+from Workstation.web.drawings_view import STYLE as DRAWINGS_STYLE
+from Workstation.web.drawings_view import draw_live
 from Workstation.web.panel_view import PanelView
-from Workstation.web.procedure import ProcedureStep
+from Workstation.web.procedure import HAND, ProcedureStep
 
 SIGN_OF = "({ 'to do': '○', 'done': '✓', 'needs attention': '!' })"
 COLOR_OF = "({ 'to do': undefined, 'done': '#2fbf8f', 'needs attention': '#f0b429' })"
@@ -20,6 +22,7 @@ html { overflow: hidden; }
 .v-application { font-size: 16px; }
 .step-sign { width: 26px; height: 26px; border-radius: 50%; border: 2px solid currentColor;
   text-align: center; line-height: 22px; font-weight: 700; }
+.part { border-top: 1px solid rgba(255, 255, 255, 0.12); padding-top: 12px; margin-top: 12px; }
 """
 
 
@@ -32,7 +35,7 @@ class Page:
         server.state.trame__title = "CranioNav"
         with VAppLayout(server) as self.layout:
             self.layout.root.theme = "dark"
-            client.Style(STYLE)
+            client.Style(STYLE + DRAWINGS_STYLE)
             self._draw_title()
             self._draw_steps(procedure)
             self._draw_open_step(procedure)
@@ -66,15 +69,65 @@ class Page:
                     )
 
     def _draw_open_step(self, procedure: tuple[ProcedureStep, ...]) -> None:
-        with v3.VNavigationDrawer(permanent=True, width=340):
+        with v3.VNavigationDrawer(permanent=True, width=350):
             for number, step in enumerate(procedure, start=1):
+                after = procedure[number] if number < len(procedure) else None
                 with html.Div(v_show=f"step === '{step.name}'", classes="pa-4", raw_attrs=[f'data-panel="{step.name}"']):
                     html.Div(f"{number}  {step.title}", classes="text-h6 mb-2")
+                    self._draw_what_next(step, after)
+                    draw_live(step.name)
                     for module, name in step.parts:
                         view = self.panels[module]
-                        view.draw(next(part for part in view.model.panel.steps if part.name == name))
+                        only_simulated = module == HAND and name != "patient"
+                        with html.Div(classes="part", v_show="simulated" if only_simulated else "true"):
+                            view.draw(next(part for part in view.model.panel.steps if part.name == name))
+                    if step.name == "report":
+                        self._draw_files()
+
+    def _draw_what_next(self, step: ProcedureStep, after: ProcedureStep | None) -> None:
+        """One line of what to do now, and the way on, which is never locked."""
+        waiting = f"([{', '.join(self._statuses(step))}].find(one => one.state !== 'done') || {{ text: '' }}).text"
+        done = f"{self._state_of(step)} === 'done'"
+        with v3.VAlert(
+            variant="tonal",
+            density="compact",
+            classes="mb-3",
+            color=(f"{done} ? 'success' : 'info'",),
+            raw_attrs=[f'data-next="{step.name}"'],
+        ):
+            html.Div(f"{{{{ {done} ? 'Done.' : 'Now: ' + ({waiting} || 'see below') }}}}", classes="text-body-1")
+            if after is not None:
+                v3.VBtn(
+                    f"Next: {after.title}",
+                    classes="mt-2",
+                    size="small",
+                    variant=(f"{done} ? 'flat' : 'outlined'",),
+                    click=f"step = '{after.name}'",
+                    raw_attrs=['data-go="next"'],
+                )
+
+    def _draw_files(self) -> None:
+        v3.VBtn(
+            "Open {{ one }}",
+            v_for="one in files",
+            key="one",
+            block=True,
+            variant="tonal",
+            classes="my-2",
+            href=("'session/' + one",),
+            target="_blank",
+            raw_attrs=[':data-file="one"'],
+        )
+
+    def _statuses(self, step: ProcedureStep) -> list[str]:
+        """JavaScript of the status of each part that has one."""
+        found = []
+        for module, name in step.parts:
+            view = self.panels[module]
+            if next(part for part in view.model.panel.steps if part.name == name).status:
+                found.append(f"{view.key}.status['{name}']")
+        return found
 
     def _state_of(self, step: ProcedureStep) -> str:
-        """A JavaScript expression: the state of the step's first part that is not done, else of its last."""
-        states = [f"{self.panels[module].key}.status['{name}'].state" for module, name in step.parts]
-        return f"([{', '.join(states)}].find(one => one !== 'done') || 'done')"
+        """A JavaScript expression: the state of the step's first part that is not done, else done."""
+        return f"([{', '.join(self._statuses(step))}].map(one => one.state).find(one => one !== 'done') || 'done')"

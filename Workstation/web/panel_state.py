@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import Enum
 from typing import Any
 
@@ -43,6 +44,15 @@ def panel_state(model: PanelModel) -> dict[str, Any]:
         if model.busy is None
         else {"label": model.busy.label, "text": model.progress.text, "share": model.progress.share},
     }
+
+
+def translated(state: Any, shown: Callable[[str], str]) -> Any:
+    """The same with every text put as it may be shown."""
+    if isinstance(state, dict):
+        return {key: translated(value, shown) for key, value in state.items()}
+    if isinstance(state, list):
+        return [translated(value, shown) for value in state]
+    return shown(state) if isinstance(state, str) else state
 
 
 def choices_of(info: ParameterInfo) -> list[str] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from CranioNavLib.panel import Action, FileField, Item, NodeField, ParameterField, PluginField, ReadOut, Step, label_of
@@ -9,7 +10,10 @@ from CranioNavLib.panel_model import PanelModel
 from trame.widgets import html
 from trame.widgets import vuetify3 as v3
 
-from Workstation.web.panel_state import choices_of, panel_state, parse
+from Workstation.web.panel_state import choices_of, panel_state, parse, translated
+
+Translation = Callable[[str], str]
+OF_THE_SESSION = ("recording_path", "output_folder")  # the session fills these in
 
 # Okabe and Ito's colours, which the colour-blind tell apart; a sign stands beside each.
 COLORS = "({ good: '#2fbf8f', warning: '#f0b429', bad: '#ff7b5c', plain: undefined })"
@@ -19,8 +23,10 @@ SIGNS = "({ good: '✓ ', warning: '! ', bad: '✗ ', plain: '' })"
 class PanelView:
     """One panel in the page; `key` names its state variable and its events."""
 
-    def __init__(self, server: Any, model: PanelModel, key: str) -> None:
+    def __init__(self, server: Any, model: PanelModel, key: str, shown: Translation = str, meant: Translation = str) -> None:
         self.server, self.model, self.key = server, model, key
+        self._shown, self._meant = shown, meant  # texts on their way to the page and back
+        self._last = ""  # action whose message stands
         self.refresh()
         model.listen(self.refresh)
         server.controller.trigger(f"{key}_change")(self._change)
@@ -30,7 +36,8 @@ class PanelView:
 
     def refresh(self) -> None:
         """Put the panel's present state into the page's."""
-        state = panel_state(self.model)
+        state = translated(panel_state(self.model), self._shown)
+        state["last"] = self._last
         if self.server.state[self.key] != state:
             with self.server.state as shared:
                 shared[self.key] = state
@@ -39,14 +46,19 @@ class PanelView:
         """The widgets of one step, in the current trame context."""
         if step.help:
             html.Div(step.help, classes="text-body-2 text-medium-emphasis mb-3")
-        html.Div(
-            f"{{{{ {self.key}.status['{step.name}'].text }}}}",
-            classes="text-body-2 mb-2",
-            v_if=f"{self.key}.status['{step.name}'].text",
-        )
         for item in step.items:
-            self._draw_item(item)
-        self._draw_footer()
+            if not _is_setting(item):
+                self._draw_item(item)
+        settings = [item for item in step.items if _is_setting(item)]
+        if settings:
+            with (
+                v3.VExpansionPanels(variant="accordion", classes="my-2"),
+                v3.VExpansionPanel(title="Details", raw_attrs=[f'data-details="{step.name}"']),
+                v3.VExpansionPanelText(),
+            ):
+                for item in settings:
+                    self._draw_item(item)
+        self._draw_footer(step)
 
     def _draw_item(self, item: Item) -> None:
         if isinstance(item, Action):
@@ -146,8 +158,11 @@ class PanelView:
             v3.VSelect(v_else_if="one.choices", items=("one.choices",), update_modelValue=changed, **shared)
             v3.VTextField(v_else=True, change=entered, suffix=("one.unit",), **shared)
 
-    def _draw_footer(self) -> None:
-        with html.Div(v_if=f"{self.key}.busy", classes="my-3"):
+    def _draw_footer(self, step: Step) -> None:
+        """What is running and what was last said; only at the step whose action it was."""
+        names = [item.name for item in step.items if isinstance(item, Action)]
+        mine = f"{names!r}.includes({self.key}.last)"
+        with html.Div(v_if=f"{self.key}.busy && {mine}", classes="my-3"):
             html.Div(f"{{{{ {self.key}.busy.text || {self.key}.busy.label }}}} …", classes="text-body-2")
             v3.VProgressLinear(
                 model_value=(f"100 * {self.key}.busy.share",), indeterminate=(f"!{self.key}.busy.share",), height=6
@@ -155,7 +170,7 @@ class PanelView:
             v3.VBtn("Cancel", size="small", variant="text", click=f"trigger('{self.key}_cancel')")
         html.Div(
             f"{{{{ {SIGNS}[{self.key}.message.level] + {self.key}.message.text }}}}",
-            v_if=f"{self.key}.message.text",
+            v_if=f"{self.key}.message.text && {mine}",
             style=(f"{{ color: {COLORS}[{self.key}.message.level] }}",),
             classes="text-body-1 my-3",
             raw_attrs=[f'data-message="{self.key}"'],
@@ -163,6 +178,7 @@ class PanelView:
 
     def _change(self, name: str, value: Any) -> None:
         field = self._field(name)
+        value = self._meant(value) if isinstance(value, str) else value
         self.model.change(field, parse(self.model.describe(field), value))
 
     def _change_setting(self, name: str, setting: str, value: Any) -> None:
@@ -173,11 +189,21 @@ class PanelView:
             self.model.change_setting(field, setting, parse(info, value))
 
     def _run(self, name: str) -> None:
+        self._last = name
         self.model.run(next(action for action in self.model.panel.actions() if action.name == name))
 
     def _field(self, name: str) -> Any:
         fields = (item for item in self.model.panel.items() if isinstance(item, (ParameterField, FileField, PluginField)))
         return next(item for item in fields if item.name == name)
+
+
+def _is_setting(item: Item) -> bool:
+    """What has a good value already, and so is shown only on request. Switches of a view are no settings."""
+    if isinstance(item, ParameterField):
+        return item.name not in ("follow", "ring")
+    if isinstance(item, PluginField):
+        return item.kind in ("segmentation", "registration")
+    return isinstance(item, NodeField) or (isinstance(item, FileField) and item.name in OF_THE_SESSION)
 
 
 def _quoted(text: str) -> str:

@@ -14,13 +14,14 @@ class ProcedureStep:
     parts: tuple[tuple[str, str], ...]  # (module, step of its panel)
 
 
-REGISTRATION, TRACKING, ULTRASOUND, HAND = "ModuleRegistration", "ModuleTracking", "ModuleUltrasound", "SimulatedHand"
+REGISTRATION, TRACKING, ULTRASOUND = "ModuleRegistration", "ModuleTracking", "ModuleUltrasound"
+HAND, SESSION, NAVIGATION = "SimulatedHand", "Session", "Navigation"
 
 PROCEDURE: tuple[ProcedureStep, ...] = (
-    ProcedureStep("ct", "CT", ((HAND, "patient"), (REGISTRATION, "ct"))),
+    ProcedureStep("ct", "CT", ((SESSION, "resume"), (HAND, "patient"), (REGISTRATION, "ct"))),
     ProcedureStep("bone", "Bone and markers", ((REGISTRATION, "bone"),)),
     ProcedureStep("devices", "Devices", ((TRACKING, "tracker"), (ULTRASOUND, "device"))),
-    ProcedureStep("calibration", "Calibration", ((TRACKING, "calibration"), (HAND, "pivot"))),
+    ProcedureStep("calibration", "Calibration", ((HAND, "pivot"), (TRACKING, "calibration"))),
     ProcedureStep("landmarks", "Landmarks", ((HAND, "landmarks"), (TRACKING, "points"), (REGISTRATION, "landmarks"))),
     ProcedureStep(
         "ultrasound",
@@ -34,5 +35,6 @@ PROCEDURE: tuple[ProcedureStep, ...] = (
         ),
     ),
     ProcedureStep("verification", "Verification", ((HAND, "targets"), (REGISTRATION, "verification"))),
-    ProcedureStep("report", "Report and export", ((REGISTRATION, "results"),)),
+    ProcedureStep("navigation", "Navigation", ((HAND, "tour"), (NAVIGATION, "navigation"))),
+    ProcedureStep("report", "Report and export", ((SESSION, "report"), (REGISTRATION, "results"))),
 )

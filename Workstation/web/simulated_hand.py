@@ -61,6 +61,12 @@ PANEL = Panel(
             "Let the simulated hand seat the sphere tool on every target and read it: the ground truth.",
             (Action("measureTargets", "Hand: measure the targets"),),
         ),
+        Step(
+            "tour",
+            "Simulated hand",
+            "Let the simulated hand lead the stylus over the head.",
+            (Action("tourTargets", "Hand: visit the targets"),),
+        ),
     ),
 )
 
@@ -76,15 +82,9 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         seed = self.parameters().read().seed
 
         def make(progress: Progress) -> Any:
-            from CranioNavLib.phantom import make_patient
             from CranioNavLib.phantom.session import SimulatedSession
 
-            from Workstation.demo_case import choose_head
-
-            progress("loading the head", 0.1)
-            volume, head = choose_head(None)
-            progress("simulating the patient", 0.3)
-            patient = make_patient(volume, seed)
+            patient, head = simulated_patient_of(seed, progress)
             progress("simulating his CT", 0.7)
             return SimulatedSession(patient, seed), patient.planning_ct, head
 
@@ -148,6 +148,13 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         scene_data.set_points("TargetsPatient", LabelledPoints(labels, positions))
         return f"{len(labels)} targets measured"
 
+    def tourTargets(self) -> str:
+        """Lead the stylus from target to target."""
+        session = self._session()
+        targets = session.patient.markers_ras_mm
+        session.play([(4.0 * number, lambda point=point: session.touch_point(point)) for number, point in enumerate(targets)])
+        return f"the stylus goes to {len(targets)} targets, one after another"
+
     def _session(self) -> Any:
         from CranioNavLib.phantom.session import running_session
 
@@ -155,3 +162,18 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         if session is None:
             raise InputError("no simulated patient lies on the table; use one in step 1")
         return session
+
+
+def simulated_patient_of(seed: int, progress: Progress) -> tuple[Any, str]:
+    """The patient of a seed, always the same, and whose head he has."""
+    import os
+
+    from CranioNavLib.phantom import make_patient
+
+    from Workstation.demo_case import choose_head
+
+    progress("loading the head", 0.1)
+    synthetic = os.environ.get("CRANIONAV_SIMULATED_HEAD") == "synthetic"
+    volume, head = (None, "synthetic head") if synthetic else choose_head(None)
+    progress("simulating the patient", 0.3)
+    return make_patient(volume, seed), head

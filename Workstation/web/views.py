@@ -1,10 +1,26 @@
-"""What the views show by themselves: a new CT in all slices, a new skull in the middle of the 3-D view."""
+"""What the views show by themselves: a new CT in all slices, the skull in the middle, tools, points without clutter."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from CranioNavLib import scene
+import numpy as np
+from CranioNavLib import host, scene, scene_data
+
+POINTS = {  # role: (size of the glyphs in mm, whether labels are drawn)
+    "LandmarksCT": (6.0, True),
+    "LandmarksPatient": (5.0, False),
+    "TargetsCT": (4.0, False),
+    "TargetsPatient": (3.0, False),
+    "ProtocolPoints": (4.0, False),
+    "SurfacePoints": (3.0, False),
+    "RegisteredPoints": (3.5, False),
+    "PlausibilityPoints": (3.0, False),
+}
+TOOLS = {"Stylus": (0.902, 0.624, 0.0), "Probe": (0.337, 0.706, 0.914), "Sphere": (0.8, 0.475, 0.655)}
+TOOL_ATTRIBUTE = "CranioNav.ToolModel"
+# half the width of the tip, of the shaft, and the length, mm
+SHAPES = {"Stylus": (0.4, 4.0, 120.0), "Probe": (3.0, 9.0, 110.0), "Sphere": (2.0, 4.0, 100.0)}
 
 
 class ViewFollower:
@@ -13,6 +29,9 @@ class ViewFollower:
     def __init__(self, slicer_app: Any) -> None:
         self._app = slicer_app
         self._shown: dict[str, tuple[str, int]] = {}
+        self._styled: set[str] = set()
+        self._tools: dict[str, Any] = {}
+        self._ring: tuple[Any, float] = (None, 0.0)
 
     def refresh(self) -> None:
         """Show what is new. Main thread only."""
@@ -21,6 +40,69 @@ class ViewFollower:
             self._app.display_manager.reset_views()
         if self._is_new("Bone", lambda node: node.GetPolyData()):
             self._app.display_manager.reset_views()
+        if self._is_new("OuterTable", lambda node: node.GetPolyData()):
+            scene.find("OuterTable").GetDisplayNode().SetVisibility(False)  # it lies on Bone: drawing both shows nothing more
+        for role in POINTS:
+            self._style(role)
+        for tool in TOOLS:
+            self._show_tool(tool)
+
+    def follow(self, tip_ras_mm: Any) -> None:
+        """Let all slices pass through a point."""
+        for view in self._app.view_manager.get_slice_views():
+            node = view.mrml_view_node if hasattr(view, "mrml_view_node") else view._view_node
+            node.JumpSliceByOffsetting(*(float(value) for value in tip_ras_mm))
+
+    def ring(self, tip_ras_mm: Any, radius_mm: float | None) -> None:
+        """A sphere of the 95% error about the tip; the slices cut it in a ring. Without a radius it is hidden."""
+        node, drawn = self._ring
+        if radius_mm is None:
+            if node is not None:
+                node.GetDisplayNode().SetVisibility(False)
+            return
+        if node is None:
+            node = _model("Error ring", (0.94, 0.71, 0.16))
+            node.GetDisplayNode().SetOpacity(0.35)
+            node.GetDisplayNode().SetVisibility2D(True)
+            node.GetDisplayNode().SetSliceIntersectionThickness(3)
+        from vtkmodules.vtkFiltersSources import vtkSphereSource
+
+        source = vtkSphereSource()
+        source.SetCenter(*(float(value) for value in tip_ras_mm))
+        source.SetRadius(float(radius_mm))
+        source.SetThetaResolution(24)
+        source.SetPhiResolution(16)
+        source.Update()
+        node.SetAndObservePolyData(source.GetOutput())
+        node.GetDisplayNode().SetVisibility(True)
+        self._ring = (node, float(radius_mm) or drawn)
+
+    def _style(self, role: str) -> None:
+        node = scene.find(role)
+        if node is None or node.GetID() in self._styled or node.GetDisplayNode() is None:
+            return
+        display, (size, labels) = node.GetDisplayNode(), POINTS[role]
+        display.SetUseGlyphScale(False)
+        display.SetGlyphSize(size)
+        display.SetTextScale(3.2)
+        display.SetPointLabelsVisibility(labels)
+        display.SetPropertiesLabelVisibility(False)
+        node.SetLocked(role != "LandmarksCT")
+        self._styled.add(node.GetID())
+
+    def _show_tool(self, tool: str) -> None:
+        pose = scene_data.get_pose(f"{tool}ToReference")
+        node = self._tools.get(tool)
+        if node is None or node.GetScene() is None:
+            if pose.matrix is None:
+                return
+            node = self._tools[tool] = _model(f"{tool} model", TOOLS[tool])
+            node.SetAndObservePolyData(_tool_shape(*SHAPES[tool]))
+            node.SetAttribute(TOOL_ATTRIBUTE, tool)
+            node.SetAndObserveTransformNodeID(scene.find(f"{tool}ToReference").GetID())
+        display, visible = node.GetDisplayNode(), int(pose.matrix is not None)
+        if display.GetVisibility() != visible:
+            display.SetVisibility(visible)
 
     def _is_new(self, role: str, content: Any) -> bool:
         node = scene.find(role)
@@ -29,3 +111,36 @@ class ViewFollower:
         changed = self._shown.get(role) != key
         self._shown[role] = key
         return changed and data is not None
+
+
+def _model(name: str, color: tuple[float, float, float]) -> Any:
+    node = host.scene().AddNewNodeByClass("vtkMRMLModelNode", name)
+    node.CreateDefaultDisplayNodes()
+    node.GetDisplayNode().SetColor(*color)
+    node.SetSelectable(False)
+    return node
+
+
+def _tool_shape(tip_mm: float, shaft_mm: float, length_mm: float) -> Any:
+    """A shaft that narrows to its tip at the origin; the tool's +z points out of the tip."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+
+    sides = 16
+    angles = np.arange(sides) * 2 * np.pi / sides
+    circle = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(sides)])
+    rings = [(tip_mm, 0.0), (shaft_mm, -25.0), (shaft_mm, -length_mm)]
+    rows = np.concatenate([circle * radius + (0.0, 0.0, height) for radius, height in rings])
+    points, cells, mesh = vtkPoints(), vtkCellArray(), vtkPolyData()
+    points.SetData(numpy_to_vtk(np.ascontiguousarray(rows), deep=True))
+    for ring in range(len(rings) - 1):
+        for side in range(sides):
+            after = (side + 1) % sides
+            corners = (ring * sides + side, ring * sides + after, (ring + 1) * sides + after, (ring + 1) * sides + side)
+            cells.InsertNextCell(4, corners)
+    for ring in (0, len(rings) - 1):
+        cells.InsertNextCell(sides, tuple(ring * sides + side for side in range(sides)))
+    mesh.SetPoints(points)
+    mesh.SetPolys(cells)
+    return mesh

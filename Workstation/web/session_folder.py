@@ -1,0 +1,167 @@
+"""The session on disk: a case folder kept up to date, from which a killed session goes on."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from CranioNavLib import host, scene, scene_data
+from CranioNavLib.errors import InputError
+from CranioNavLib.files import output_folder, write_text
+from CranioNavLib.slicer_files import LabelledPoints, read_points, write_points
+
+STATE_FILE = "session.json"
+RECORDING = "palpation.igs.mha"
+LISTS = {
+    "LandmarksCT": "landmarks-ct.mrk.json",
+    "LandmarksPatient": "landmarks-patient.mrk.json",
+    "TargetsCT": "targets-ct.mrk.json",
+    "TargetsPatient": "targets-patient.mrk.json",
+    "PlausibilityPoints": "plausibility.mrk.json",
+}
+REGISTRATION_ATTRIBUTES = (scene.STATUS_ATTRIBUTE, scene_data.MOTION_ERROR)
+SHOWN_AS = "session"  # what the page shows in place of the folder's path
+
+
+def default_parent() -> Path:
+    """Where sessions lie unless a folder is named."""
+    return Path.home() / "CranioNav"
+
+
+def new_folder() -> Path:
+    """A folder for a session that begins now; made when something is written."""
+    return default_parent() / time.strftime("%Y-%m-%d %H-%M-%S")
+
+
+def last_session(besides: Path) -> Path | None:
+    """The newest session that can go on: in the folder itself, else the newest under the same parent."""
+    if (besides / STATE_FILE).is_file():
+        return besides
+    if besides.parent != default_parent() or not besides.parent.is_dir():
+        return None
+    folders = sorted(path.parent for path in besides.parent.glob(f"*/{STATE_FILE}"))
+    return folders[-1] if folders else None
+
+
+class SessionFolder:
+    """Writes what changed; everything that it writes is whole at any moment."""
+
+    def __init__(self, folder: Path, parameter_nodes: Callable[[], Iterable[Any]]) -> None:
+        self.folder, self._parameter_nodes = Path(folder), parameter_nodes
+        self.simulated_seed: int | None = None
+        self._stamps: dict[str, int] = {}
+        self._ct_image: Any = None
+        self._state = ""
+
+    @property
+    def recording_path(self) -> str:
+        """Where the next palpation is recorded by default; an earlier one is not written over."""
+        names = [RECORDING, *(f"palpation-{number}.igs.mha" for number in range(2, 100))]
+        return str(self.folder / next(name for name in names if not (self.folder / name).exists()))
+
+    def shown(self, text: str) -> str:
+        """A text for the page: the folder's own path is not told."""
+        return text.replace(str(self.folder), SHOWN_AS)
+
+    def meant(self, text: str) -> str:
+        """The inverse, for what the page sends."""
+        return str(self.folder) + text[len(SHOWN_AS) :] if text == SHOWN_AS or text.startswith(SHOWN_AS + "/") else text
+
+    def ct_to_write(self) -> Any | None:
+        """The scene's CT (Volume), if the folder does not have it yet; write it with `write_ct`, in any thread."""
+        node = scene.find("CT")
+        if node is None or node.GetImageData() is None or node.GetImageData() is self._ct_image:
+            return None
+        self._ct_image = node.GetImageData()
+        return scene_data.get_volume("CT")
+
+    def write_ct(self, volume: Any) -> None:
+        """Put the CT into the folder."""
+        from CranioNavLib.phantom.case_writer import write_volume
+
+        write_volume(output_folder(self.folder) / "ct.nrrd", volume)
+
+    def save(self, step: str) -> None:
+        """Write the lists and the state, where they changed. Main thread only."""
+        for role, name in LISTS.items():
+            self._save_list(role, output_folder(self.folder) / name if scene.find("CT") is not None else None)
+        if scene.find("CT") is None:
+            return
+        state = json.dumps(self._collect(step), indent=1)
+        if state != self._state:
+            write_text(self.folder / STATE_FILE, state + "\n")
+            self._state = state
+
+    def _save_list(self, role: str, path: Path | None) -> None:
+        node = scene.find(role)
+        stamp = node.GetMTime() if node is not None else 0
+        if path is None or self._stamps.get(role, 0) == stamp:
+            return
+        self._stamps[role] = stamp
+        if node is None or not node.GetNumberOfControlPoints():
+            path.unlink(missing_ok=True)
+            return
+        write_points(path, scene_data.get_points(role), role)
+
+    def _collect(self, step: str) -> dict[str, Any]:
+        registration = scene.find("ReferenceToRas")
+        registered = registration is not None and registration.GetAttribute(scene.STATUS_ATTRIBUTE)
+        return {
+            "step": step,
+            "simulated_seed": self.simulated_seed,
+            "bone": scene.find("OuterTable") is not None,
+            "planned": scene.find("ProtocolPoints") is not None,
+            "points": scene.find("SurfacePoints") is not None,
+            "parameters": {
+                node.GetName(): {name: node.GetParameter(name) for name in node.GetParameterNames()}
+                for node in self._parameter_nodes()
+            },
+            "registration": None
+            if not registered
+            else {
+                "matrix": scene_data.get_transform("ReferenceToRas").tolist(),
+                "attributes": {name: registration.GetAttribute(name) for name in REGISTRATION_ATTRIBUTES},
+                "results": scene_data.get_table("Results") if scene.find("Results") is not None else None,
+            },
+        }
+
+    def read_state(self) -> dict[str, Any]:
+        """What `save` wrote.
+
+        Raises
+        ------
+        InputError
+            There is no such file, or it cannot be read.
+        """
+        try:
+            state: dict[str, Any] = json.loads((self.folder / STATE_FILE).read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(f"the session cannot be read: {error}; begin a new one") from None
+        return state
+
+    def read_lists(self) -> dict[str, LabelledPoints]:
+        """The point lists in the folder, by role."""
+        return {role: read_points(self.folder / name) for role, name in LISTS.items() if (self.folder / name).is_file()}
+
+    def restore_parameters(self, state: dict[str, Any]) -> None:
+        """Give the modules' parameter nodes what they held. Main thread only."""
+        for node in self._parameter_nodes():
+            with host.slicer_package().util.NodeModify(node):
+                for name, value in state["parameters"].get(node.GetName(), {}).items():
+                    node.SetParameter(name, value)
+
+    def restore_registration(self, state: dict[str, Any]) -> None:
+        """Set ReferenceToRas with its status, and the results. Main thread only."""
+        kept = state["registration"]
+        if kept is None:
+            return
+        scene_data.set_transform("ReferenceToRas", kept["matrix"])
+        node = scene.find_or_create("ReferenceToRas")
+        for name, value in kept["attributes"].items():
+            if value:
+                node.SetAttribute(name, value)
+        if kept["results"]:
+            scene_data.set_table("Results", kept["results"])

@@ -1,0 +1,185 @@
+"""The session as a panel: go on with one that was interrupted, and write its report."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from CranioNavLib import scene, scene_data
+from CranioNavLib.errors import InputError
+from CranioNavLib.module_logic import ParametersInScene
+from CranioNavLib.panel import Action, Level, Panel, Progress, Reading, ReadOut, Step, StepState, StepStatus, Task
+from CranioNavLib.parameters import Parameters
+from CranioNavLib.scripted_module import ScriptedLoadableModuleLogic
+
+from Workstation.web.session_folder import SessionFolder, last_session
+
+OFFERED = ("report.html", "scene.mrb", "ReferenceToRas.tfm", "registration.json")  # what the page lets one open
+SAME_MM = 0.05  # between the registration on the screen and the one that the report repeats from the files
+
+
+@dataclass(frozen=True)
+class SessionParameters(Parameters):
+    """A session has none of its own."""
+
+
+PANEL = Panel(
+    module="Session",
+    title="Session",
+    parameters=SessionParameters,
+    steps=(
+        Step(
+            "resume",
+            "Go on",
+            "",
+            (Action("resumeSession", "Go on with the last session", "CT, points, settings and registration as they were left"),),
+        ),
+        Step(
+            "report",
+            "Report",
+            "The saved session is registered anew from its files, and what comes out is written as report, scene and transform.",
+            (
+                Action("writeReport", "Write report and export", "Takes half a minute", primary=True),
+                ReadOut("reportFiles", "Written"),
+            ),
+            status="reportStatus",
+        ),
+    ),
+)
+
+
+class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
+    """Brings a saved session back, and has its report made by a process of its own."""
+
+    parameterClass = SessionParameters
+    sessionRole = "WorkstationSession"
+
+    def __init__(self, session: SessionFolder, logics: dict[str, Any], go_to: Any) -> None:
+        super().__init__()
+        self.session, self._logics, self._go_to = session, logics, go_to
+        self._resumable = last_session(session.folder)
+        self._report_of = ""  # the registration that the report shows
+
+    # Going on
+
+    def resumeSession(self) -> Task:
+        """Read the session; the bone comes from the cache, the points from the recording."""
+        from ModuleRegistrationLib.anatomy.ct_reader import read_ct
+        from ModuleRegistrationLib.anatomy.segmentation import segment_bone
+
+        assert self._resumable is not None  # or it is blocked
+        self.session.folder = self._resumable
+        state, lists = self.session.read_state(), self.session.read_lists()
+
+        def read(progress: Progress) -> Any:
+            progress("reading the CT", 0.1)
+            volume = read_ct(self.session.folder / "ct.nrrd")
+            progress("finding the bone", 0.4)
+            bone = segment_bone(volume) if state["bone"] else None
+            patient = None
+            if state["simulated_seed"] is not None:
+                progress("laying the simulated patient on the table", 0.7)
+                patient = _simulated_session(state["simulated_seed"])
+            return state, lists, volume, bone, patient
+
+        return Task("Go on with the last session", read, lambda found: self._bring_back(*found))
+
+    def resumeSessionBlocked(self) -> str:
+        """Why there is nothing to go on with."""
+        if scene.find("CT") is not None:
+            return "a session is under way"
+        return "" if self._resumable is not None else "no earlier session"
+
+    def _bring_back(self, state: dict[str, Any], lists: Any, volume: Any, bone: Any, patient: Any) -> str:
+        registration = self._logics["ModuleRegistration"]
+        registration.takeCt(volume)
+        if bone is not None:
+            registration._takeBone(bone)
+        for role, points in lists.items():
+            scene_data.set_points(role, points)
+        self.session.restore_parameters(state)
+        if patient is not None:
+            from CranioNavLib.phantom.session import use_session
+
+            use_session(patient)
+            self.session.simulated_seed = state["simulated_seed"]
+        ultrasound = self._logics["ModuleUltrasound"]
+        if state["planned"] and bone is not None:
+            ultrasound.planProtocol()
+        if state["points"] and Path(ultrasound.parameters().read().recording_path).is_file():
+            ultrasound.measureRecording().run()
+        self.session.restore_registration(state)
+        self._go_to(state["step"])
+        return "the session goes on where it was; connect the devices again"
+
+    # Report
+
+    def writeReport(self) -> Task:
+        """Register the saved case anew, in a process of its own, and write everything there is to take along."""
+        self.session.save("report")
+        wanted = self._logics["ModuleRegistration"].parameters().read()
+        recording = Path(self._logics["ModuleUltrasound"].parameters().read().recording_path)
+        folder, shown = self.session.folder, scene_data.get_transform("ReferenceToRas")
+        if not recording.is_file():
+            raise InputError("there is no recording of a palpation; the report is written of an ultrasound registration")
+
+        def write(progress: Progress) -> float:
+            progress("registering the saved session and drawing the report", 0.0)
+            if recording.name != "palpation.igs.mha" or recording.parent != folder:
+                redirection = json.dumps({"palpation": str(recording)})
+                (folder / "case.json").write_text(redirection, encoding="utf-8")
+            command = [sys.executable, "-m", "Workstation", "register", str(folder), "-o", str(folder), "--mode", "III"]
+            command += ["--method", wanted.method, "--segmentation", wanted.segmentation]
+            root = Path(__file__).resolve().parents[2]
+            done = subprocess.run(command, capture_output=True, text=True, cwd=root, check=False)
+            if done.returncode != 0:
+                raise InputError((done.stderr.strip().splitlines() or ["the report could not be written"])[-1])
+            record = json.loads((folder / "registration.json").read_text(encoding="utf-8"))
+            corners = np.array([[0, 0, 0, 1], [80, 0, 0, 1], [0, 80, 0, 1], [0, 0, 80, 1]], dtype=float)
+            return float(np.abs((np.array(record["reference_to_ras"]) - shown) @ corners.T).max())
+
+        return Task("Write report and export", write, self._report_written)
+
+    def writeReportBlocked(self) -> str:
+        """Why there is nothing to report."""
+        node = scene.find("ReferenceToRas")
+        if node is None or not node.GetAttribute(scene.STATUS_ATTRIBUTE):
+            return "register first"
+        return "" if (self.session.folder / "ct.nrrd").is_file() else "the CT is still being saved"
+
+    def _report_written(self, difference_mm: float) -> str:
+        self._report_of = json.dumps(scene_data.get_transform("ReferenceToRas").tolist())
+        if difference_mm > SAME_MM:
+            return f"written; settings differ from the defaults, so the report's registration lies {difference_mm:.2f} mm off"
+        return "written; the registration from the files is the one on the screen"
+
+    def reportFiles(self) -> Reading | None:
+        """What there is to open."""
+        names = self.offered()
+        return Reading(", ".join(names), Level.GOOD) if names else None
+
+    def offered(self) -> list[str]:
+        """Files of the session that the page may open, once they are of this registration."""
+        return [name for name in OFFERED if (self.session.folder / name).is_file()] if self._report_of else []
+
+    def reportStatus(self) -> StepStatus:
+        """Whether the report is of the registration in force."""
+        if not self._report_of:
+            return StepStatus(StepState.TODO, self.writeReportBlocked() or "write the report")
+        if self._report_of != json.dumps(scene_data.get_transform("ReferenceToRas").tolist()):
+            return StepStatus(StepState.ATTENTION, "the registration has changed; write the report again")
+        return StepStatus(StepState.DONE)
+
+
+def _simulated_session(seed: int) -> Any:
+    from CranioNavLib.phantom.session import SimulatedSession
+
+    from Workstation.web.simulated_hand import simulated_patient_of
+
+    patient, _ = simulated_patient_of(seed, Progress())
+    return SimulatedSession(patient, seed)
