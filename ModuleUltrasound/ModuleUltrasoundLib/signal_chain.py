@@ -99,8 +99,8 @@ def design_band(acquisition: Acquisition, samples: int, until_s: float) -> Band:
 
 def complex_envelopes(lines: npt.NDArray[np.int16], band: Band) -> Envelopes:
     """Complex envelopes of RF lines (n, N): DC and drift removed, band-passed without phase, demodulated."""
-    rf = remove_drift(lines[:, : band.length])
-    spectrum = fft.rfft(rf, n=band.padded, axis=1)[:, band.first : band.first + len(band.gain)] * band.gain
+    rf = remove_drift(lines[:, : band.length], band.padded)
+    spectrum = fft.rfft(rf, axis=1)[:, band.first : band.first + len(band.gain)] * band.gain
     shifted = np.zeros((len(rf), band.out_length), dtype=np.complex64)
     below = band.centre - band.first
     shifted[:, : len(band.gain) - below] = spectrum[:, below:]
@@ -112,14 +112,16 @@ def complex_envelopes(lines: npt.NDArray[np.int16], band: Band) -> Envelopes:
     return Envelopes(values=values[:, :keep], rate_hz=band.rate_hz, carrier_hz=band.carrier_hz)
 
 
-def remove_drift(lines: npt.NDArray[np.int16]) -> Floats:
-    """Lines as float32 without offset, and without their straight-line drift where they have one.
+def remove_drift(lines: npt.NDArray[np.int16], padded: int = 0) -> Floats:
+    """Lines as float32 without offset, and without their straight-line drift where they have one; zeros up to `padded` samples.
 
     Both are taken from the quiet second half. Slower waves are left to the band-pass; only the step between a line's end and
     its start would pass it.
     """
-    rf = lines.astype(np.float32)
-    length = rf.shape[1]
+    count, length = lines.shape
+    whole = np.zeros((count, max(padded, length)), dtype=np.float32)
+    rf = whole[:, :length]
+    rf[:] = lines
     quarter = max(length // 4, 1)
     third = rf[:, -2 * quarter : -quarter].mean(axis=1)
     fourth = rf[:, -quarter:].mean(axis=1)
@@ -129,4 +131,4 @@ def remove_drift(lines: npt.NDArray[np.int16]) -> Floats:
     if len(drifting):
         ramp = np.arange(length, dtype=np.float32) - np.float32(length - quarter / 2 - 0.5)
         rf[drifting] -= slope[drifting, None] * ramp
-    return rf
+    return whole
