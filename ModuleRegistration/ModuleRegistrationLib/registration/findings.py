@@ -20,9 +20,10 @@ ORDER = (ACCEPTED, WARNING, REFUSED)
 HEAD_RADIUS_MM = 75.0  # turns a rotation into a distance at the skull
 AMBIGUOUS_PROBABILITY, AMBIGUOUS_MM = 0.1, 1.5
 LARGE_RMS_MM, HUGE_RMS_MM = 1.5, 3.0  # of the points used: A-mode and stylus points scatter by 0.3-0.8 mm
-REJECTED_WARNED, REJECTED_REFUSED = 0.25, 0.45  # share of the points
+REJECTED_WARNED, REJECTED_REFUSED = 0.3, 0.45  # share of the points
 SCALE_FOUND, SCALE_SIGMAS = 0.01, 4.0
 MOVED_MM, MOVED_P = 1.0, 1e-3
+SWEEP_POINTS, SWEEP_MOVED_MM = 60, 2.0  # the biases of single sweeps look like small jumps
 LEAST_PER_SIDE, MOST_SPLITS = 5, 40
 LANDMARK_FAR_MM = 15.0
 ONE_SIDED = 0.2  # of the skull's half size: how far points must reach beyond its middle to see the other side
@@ -170,7 +171,8 @@ def find_moved_reference(problem: RegistrationProblem, result: RegistrationResul
         chance = float(stats.f.sf((plain - left) / 3 / max(left / freedom, 1e-12), 3, freedom))
         best = min(best, (chance, int(split), float(np.linalg.norm(solution[-3:]))))
     chance, split, shift = best
-    if chance * len(splits) < MOVED_P and shift > MOVED_MM:
+    enough = MOVED_MM if len(points) <= SWEEP_POINTS else SWEEP_MOVED_MM
+    if chance * len(splits) < MOVED_P and shift > enough:
         label = problem.points.labels[int(np.flatnonzero(result.used)[split])]
         return [
             Finding(

@@ -22,7 +22,7 @@ from ModuleRegistrationLib.registration.problem import RegistrationProblem
 
 PARAMETERS = 8  # rotation, translation, offset, speed
 OUTLIER_WIDTH_MM = 3.0  # of the Cauchy law of outliers: another tissue interface lies 2-8 mm away
-OUTLIER_PRIOR = (1.0, 12.0)  # pseudo-counts of outliers and of points: about one in twelve before any data
+OUTLIER_PRIOR = (2.0, 16.0)  # pseudo-counts of outliers and of points: one in eight before any data
 SCALE_FREEDOM = 6.0  # what the stated variances are worth, in points: right to a factor of two or so
 LEAST_SCALE = 0.2  # of the variances: nothing measures much better than it says
 LANDMARK_SD_MM, LANDMARK_FREEDOM = 2.5, 1.0  # per axis; the prior is so broad that 1 mm and 8 mm are both likely
@@ -228,7 +228,7 @@ def advance(
     hessian, gradient = normal_equations(model, state, found)
     step = -np.linalg.solve(hessian, gradient[..., None])[..., 0]
     arm = model.points - model.pivot
-    shift = _cross(step[:, None, :3], arm[None]) + step[:, None, 3:6]
+    shift = _cross(np.asarray(step[:, None, :3], dtype=np.float64), arm[None]) + step[:, None, 3:6]
     length = np.sqrt((shift**2).sum(axis=-1).mean(axis=1))
     step = step * np.minimum(1, longest_step_mm / np.maximum(length, 1e-12))[:, None]
     motion = rigid_from_vector(step[:, :3], step[:, 3:6], model.pivot) @ state.motion

@@ -17,7 +17,7 @@ from ModuleRegistrationLib.registration.shared_errors import refine
 DENSE = 60  # points; beyond, the posterior is Gaussian and what points share decides the accuracy
 SEARCH_POINTS = 40
 PLAUSIBLE_SCORE = 6.0  # a minimum e^6 less likely than the best is not looked at again
-MOST_MINIMA = 4
+MOST_MINIMA = 8
 POLISH_STEPS, POLISH_STEP_MM, POLISHED_MM = 12, 2.0, 1e-2
 INLIER = 0.5
 
