@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -107,6 +108,8 @@ def register_case(
         initial_reference_to_ras=landmarks.reference_to_ras,
         landmarks_ct_mm=planned,
         landmarks_patient_mm=patient,
+        # with bone points the method estimates the landmarks' error itself
+        landmark_sd_mm=USUAL_FLE_MM[mode] / math.sqrt(3) if mode in LANDMARK_MODES else None,
         surface_sd_mm=bone.position_sd_mm,
         surface_offset_sd_mm=bone.offset_sd_mm,
     )

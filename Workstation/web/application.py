@@ -22,12 +22,12 @@ from Workstation.web.panel_view import PanelView
 from Workstation.web.procedure import HAND, NAVIGATION, PROCEDURE, REGISTRATION, SESSION, TRACKING, ULTRASOUND
 from Workstation.web.session_folder import SessionFolder, new_folder
 from Workstation.web.session_panel import SessionLogic
-from Workstation.web.views import ViewFollower
+from Workstation.web.views import ViewFollower, registered
 
 POLL_S = 0.04  # devices: at least 20 updates a second reach the views
 REFRESH_EVERY = 5  # polls between two looks at the read-outs
 SAVE_EVERY = 25  # polls between two looks at what is to be saved
-PICTURE_QUALITY = 85  # JPEG; one quality for moving and still pictures, so that none is sent twice
+PICTURE_QUALITY = 90  # JPEG; one quality for moving and still pictures, so that none is sent twice
 LOG = logging.getLogger(__name__)
 
 
@@ -102,9 +102,11 @@ class WorkstationApp(TrameApp):
         """Bring the devices' news into the scene, and the scene's into the panels."""
         for turn in itertools.count():
             await asyncio.sleep(POLL_S)
+            self.budget.muted = not registered()  # where a tool is in the CT is not known yet, and it is not drawn
             for name in (TRACKING, ULTRASOUND):
                 with contextlib.suppress(InputError):  # the logic keeps the reason and its panel shows it
                     self.logics[name].poll()
+            self.budget.muted = False
             try:
                 self._turn(turn)
             except Exception:  # a read-out's defect must not end tracking

@@ -9,7 +9,7 @@ from typing import Any
 from trame_slicer.views import ScheduledRenderStrategy
 
 FASTEST_S = 1 / 25  # between two pictures of one view
-SHARE = 0.5  # of the event loop's time, for the rendering of all views together
+SHARE = 0.4  # of the event loop's time, for the rendering of all views together
 
 
 class RenderBudget:
@@ -17,6 +17,7 @@ class RenderBudget:
 
     def __init__(self) -> None:
         self._lasted_s: dict[int, float] = {}
+        self.muted = False  # requests are dropped: what changes now is not drawn
 
     def note(self, view: Any, seconds: float) -> None:
         """A view has rendered."""
@@ -48,7 +49,7 @@ class PacedRendering(ScheduledRenderStrategy):
 
     def schedule_render(self) -> None:
         """Ask for a picture, now or when the period is over."""
-        if self._pending is not None:
+        if self._pending is not None or self._budget.muted:
             return
         try:
             loop = asyncio.get_running_loop()

@@ -36,5 +36,5 @@ PROCEDURE: tuple[ProcedureStep, ...] = (
     ),
     ProcedureStep("verification", "Verification", ((HAND, "targets"), (REGISTRATION, "verification"))),
     ProcedureStep("navigation", "Navigation", ((HAND, "tour"), (NAVIGATION, "navigation"))),
-    ProcedureStep("report", "Report and export", ((SESSION, "report"), (REGISTRATION, "results"))),
+    ProcedureStep("report", "Report and export", ((SESSION, "report"),)),
 )

@@ -8,7 +8,7 @@ import numpy as np
 from CranioNavLib import host, scene, scene_data
 
 POINTS = {  # role: (size of the glyphs in mm, whether labels are drawn)
-    "LandmarksCT": (6.0, True),
+    "LandmarksCT": (6.0, False),
     "LandmarksPatient": (5.0, False),
     "TargetsCT": (4.0, False),
     "TargetsPatient": (3.0, False),
@@ -18,6 +18,7 @@ POINTS = {  # role: (size of the glyphs in mm, whether labels are drawn)
     "PlausibilityPoints": (3.0, False),
 }
 TOOLS = {"Stylus": (0.902, 0.624, 0.0), "Probe": (0.337, 0.706, 0.914), "Sphere": (0.8, 0.475, 0.655)}
+DIVISIONS = (140, 140, 140)  # of the bone as drawn: cells of about 1.5 mm
 TOOL_ATTRIBUTE = "CranioNav.ToolModel"
 # half the width of the tip, of the shaft, and the length, mm
 SHAPES = {"Stylus": (0.4, 4.0, 120.0), "Probe": (3.0, 9.0, 110.0), "Sphere": (2.0, 4.0, 100.0)}
@@ -31,6 +32,7 @@ class ViewFollower:
         self._shown: dict[str, tuple[str, int]] = {}
         self._styled: set[str] = set()
         self._tools: dict[str, Any] = {}
+        self._bone: Any = None
         self._ring: tuple[Any, float] = (None, 0.0)
 
     def refresh(self) -> None:
@@ -39,9 +41,12 @@ class ViewFollower:
             self._app.display_manager.show_volume_in_slice_background(scene.find("CT"))
             self._app.display_manager.reset_views()
         if self._is_new("Bone", lambda node: node.GetPolyData()):
+            self._show_bone(scene.find("Bone"))
             self._app.display_manager.reset_views()
         if self._is_new("OuterTable", lambda node: node.GetPolyData()):
             scene.find("OuterTable").GetDisplayNode().SetVisibility(False)  # it lies on Bone: drawing both shows nothing more
+        if scene.find("Bone") is None and self._bone is not None and self._bone.GetScene() is not None:
+            host.scene().RemoveNode(self._bone)  # another CT: its bone is not found yet
         for role in POINTS:
             self._style(role)
         for tool in TOOLS:
@@ -49,8 +54,8 @@ class ViewFollower:
 
     def follow(self, tip_ras_mm: Any) -> None:
         """Let all slices pass through a point."""
-        for view in self._app.view_manager.get_slice_views():
-            node = view.mrml_view_node if hasattr(view, "mrml_view_node") else view._view_node
+        for index in range(host.scene().GetNumberOfNodesByClass("vtkMRMLSliceNode")):
+            node = host.scene().GetNthNodeByClass(index, "vtkMRMLSliceNode")
             node.JumpSliceByOffsetting(*(float(value) for value in tip_ras_mm))
 
     def ring(self, tip_ras_mm: Any, radius_mm: float | None) -> None:
@@ -94,15 +99,31 @@ class ViewFollower:
         pose = scene_data.get_pose(f"{tool}ToReference")
         node = self._tools.get(tool)
         if node is None or node.GetScene() is None:
-            if pose.matrix is None:
+            if pose.matrix is None or not registered():
                 return
             node = self._tools[tool] = _model(f"{tool} model", TOOLS[tool])
             node.SetAndObservePolyData(_tool_shape(*SHAPES[tool]))
             node.SetAttribute(TOOL_ATTRIBUTE, tool)
             node.SetAndObserveTransformNodeID(scene.find(f"{tool}ToReference").GetID())
-        display, visible = node.GetDisplayNode(), int(pose.matrix is not None)
+        display, visible = node.GetDisplayNode(), int(pose.matrix is not None and registered())
         if display.GetVisibility() != visible:
             display.SetVisibility(visible)
+
+    def _show_bone(self, bone: Any) -> None:
+        """A coarser copy is drawn in place of the bone: without a graphics card every triangle counts."""
+        from vtkmodules.vtkFiltersCore import vtkBinnedDecimation, vtkPolyDataNormals
+
+        coarse = vtkBinnedDecimation()
+        coarse.SetInputData(bone.GetPolyData())
+        coarse.SetNumberOfDivisions(*DIVISIONS)
+        smooth = vtkPolyDataNormals()
+        smooth.SetInputConnection(coarse.GetOutputPort())
+        smooth.SplittingOff()
+        smooth.Update()
+        if self._bone is None or self._bone.GetScene() is None:
+            self._bone = _model("Bone as drawn", scene.BONE)
+        self._bone.SetAndObservePolyData(smooth.GetOutput())
+        bone.GetDisplayNode().SetVisibility(False)
 
     def _is_new(self, role: str, content: Any) -> bool:
         node = scene.find(role)
@@ -113,11 +134,18 @@ class ViewFollower:
         return changed and data is not None
 
 
+def registered() -> bool:
+    """Whether ReferenceToRas means anything yet."""
+    node = scene.find("ReferenceToRas")
+    return node is not None and bool(node.GetAttribute(scene.STATUS_ATTRIBUTE))
+
+
 def _model(name: str, color: tuple[float, float, float]) -> Any:
     node = host.scene().AddNewNodeByClass("vtkMRMLModelNode", name)
     node.CreateDefaultDisplayNodes()
     node.GetDisplayNode().SetColor(*color)
     node.SetSelectable(False)
+    node.SetSaveWithScene(False)
     return node
 
 
