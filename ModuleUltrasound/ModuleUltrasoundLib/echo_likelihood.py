@@ -59,7 +59,6 @@ SHARED_NAMES = (
     "polarity known",
     "support",
     "has neighbours",
-    "static",
     "contact",
     "slope",
 )
@@ -84,7 +83,6 @@ def shared_features(found: Found, scores: Array, runs: npt.NDArray[np.int64]) ->
         np.full(scores.shape, polarity_known),
         support,
         np.broadcast_to(neighbours[:, None], scores.shape),
-        static_share(depth_mm, runs),
         np.broadcast_to(contact(found.forerun.amplitude)[:, None], scores.shape),
         np.full(scores.shape, slope / 3),
     ]
@@ -162,21 +160,3 @@ def contact(amplitude: Array) -> Array:
         return np.zeros(len(amplitude))
     middle = float(np.median(amplitude[seen]))
     return np.where(seen, np.clip(DECIBEL * np.log(np.where(seen, amplitude, middle) / middle) / 10, -3, 3), 0.0)
-
-
-def static_share(depth_mm: Array, spots: npt.NDArray[np.int64]) -> Array:
-    """Share of the other places on the head that show an echo at this very depth: an artefact does, bone does not."""
-    bins = np.nan_to_num(np.floor(depth_mm / 0.2), nan=-1).astype(np.int64)
-    top = max(int(bins.max(initial=0)) + 2, 2)
-    _, place = np.unique(spots, return_inverse=True)
-    places = int(place.max(initial=0)) + 1
-    if places < 4:
-        return np.zeros(depth_mm.shape)
-    shown = np.zeros((places, top + 1), dtype=bool)
-    shown[np.repeat(place, bins.shape[1]), np.where(bins < 0, top, bins).ravel()] = True
-    shown[:, top] = False
-    wide = shown.copy()
-    wide[:, 1:] |= shown[:, :-1]
-    wide[:, :-1] |= shown[:, 1:]
-    share = (wide.sum(axis=0) - 1) / (places - 1)
-    return np.asarray(np.where(bins >= 0, share[np.clip(bins, 0, top)], 0.0) * min((places - 3) / 8, 1.0))

@@ -41,7 +41,7 @@ class World:
 def make_world(seed: int) -> World:
     """Simulate and search one recording; the speed of sound is known to a few per cent, as in use."""
     rng = np.random.default_rng(seed)
-    frames = int(rng.choice([1, 5, 20, 40, 80], p=[0.15, 0.15, 0.25, 0.25, 0.2]))
+    frames = int(rng.choice([1, 5, 20, 40, 80], p=[0.15, 0.15, 0.25, 0.3, 0.15]))
     recording, truth, world = simulate(rng, frames, without_bone=float(rng.choice([0.1, 0.3, 0.6])))
     runs = stays(recording)
     assumed = world.speed_m_s if rng.random() < 0.7 else float(rng.uniform(1450, 1630))

@@ -27,6 +27,7 @@ SPEED_M_S = (1450.0, 1630.0)
 ATTENUATION_DB_CM_MHZ = (0.3, 2.6)
 DEPTH_MM = (2.0, 15.0)
 SNR_DB = (12.0, 40.0)
+SAME_DEPTH_SHARE = 0.45  # of the recordings have about one depth everywhere
 PLAIN_SHARE = 0.3  # of the worlds are textbook ones
 BONE_SPEED_M_S = (2700.0, 3500.0)
 
@@ -111,8 +112,8 @@ def draw_world(rng: np.random.Generator, frames_a_point: int | None = None) -> W
         snr_per_line=bool(rng.random() < 0.6),
         bone_reflection=rng.uniform(0.4, 0.66),
         tilt_law=str(rng.choice(["specular", "cosine", "none"], p=[0.6, 0.25, 0.15])),
-        tilt_width_deg=rng.uniform(1.2, 6),
-        tilt_floor=10 ** (-rng.uniform(12, 30) / 20),
+        tilt_width_deg=rng.uniform(1.0, 6),
+        tilt_floor=10 ** (-rng.uniform(12, 34) / 20),
         speckle_db=rng.choice([rng.uniform(20, 50), 90.0], p=[0.8, 0.2]),
         speckle_per_us=rng.uniform(2, 8),
         galea_db=(a := rng.uniform(8, 24), a + rng.uniform(0, 10)),
@@ -198,9 +199,12 @@ def simulate(
     repeat = np.repeat(np.arange(count), world.frames_a_point)[:frames]
     wander = 0.15 * np.cumsum(rng.normal(size=frames)) * 0.3
     wander = np.clip(wander - wander.mean(), -0.6, 0.6)
-    depth = np.clip(rng.uniform(*DEPTH_MM, count)[repeat] + wander * (world.frames_a_point > 1), *DEPTH_MM)
+    places = rng.uniform(*DEPTH_MM, count)
+    if rng.random() < SAME_DEPTH_SHARE:  # a head's scalp is alike from place to place; a phantom's layer is the same
+        places = np.clip(rng.uniform(*DEPTH_MM) + rng.uniform(0, 1.5) * rng.normal(size=count), *DEPTH_MM)
+    depth = np.clip(places[repeat] + wander * (world.frames_a_point > 1), *DEPTH_MM)
     tilt = np.abs(rng.uniform(0, most_tilt_deg, count)[repeat] + rng.normal(0, 0.4, frames))
-    kinds = np.where(rng.random(count) < without_bone, rng.choice(["tissue", "air", "noise"], count, p=[0.5, 0.35, 0.15]), "bone")
+    kinds = np.where(rng.random(count) < without_bone, rng.choice(["tissue", "air", "noise"], count, p=[0.55, 0.3, 0.15]), "bone")
     kind = kinds[repeat]
     layer_fraction = rng.uniform(0.1, 0.95, (count, 3))
     layer_db = rng.uniform(*world.galea_db, (count, 3))

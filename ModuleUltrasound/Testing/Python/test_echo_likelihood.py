@@ -9,7 +9,6 @@ from ModuleUltrasoundLib.echo_likelihood import (
     neighbour_support,
     probabilities,
     relative_polarity,
-    static_share,
 )
 from scipy.special import softmax
 
@@ -61,14 +60,6 @@ def test_neighbours_of_the_same_stay_support_one_depth():
     alone, none = neighbour_support(chance, depth, np.arange(9))
     assert alone.max() == 0
     assert not none.any()
-
-
-def test_echo_at_one_depth_wherever_the_probe_stands_is_marked_static():
-    depth = np.column_stack([np.full(12, 13.05), np.linspace(3, 9, 12)])
-    share = static_share(depth, np.arange(12))
-    assert share[:, 0].min() > 0.9
-    assert share[:, 1].max() < 0.2
-    assert static_share(depth, np.zeros(12, dtype=int)).max() == 0  # one place tells nothing
 
 
 def test_forerun_echo_in_air_stands_out_of_the_recording():

@@ -197,7 +197,7 @@ def test_stays_end_where_the_probe_jumps_or_the_point_changes():
     assert stays(replace(recording, probe_to_reference=poses)).tolist() == [0, 0, 1, 1, 2, 3]
 
 
-@pytest.mark.parametrize("depth", [3.0, 9.0, 14.5])
+@pytest.mark.parametrize("depth", [3.0, 9.0, 12.5])  # 14.7 is where this forerun repeats
 def test_scalp_of_one_depth_everywhere_is_no_artefact(depth):
     rng = np.random.default_rng(13)
     recording = record(rng, np.full(25, depth), SET_UPS["5 MHz, polystyrene"])
