@@ -49,7 +49,7 @@ class WorkstationApp(TrameApp):
             self.logics[panel.module] = logic
             key = panel.module.replace("Module", "").lower()
             model = PanelModel(panel, logic, self.runner)
-            self.panels[panel.module] = PanelView(self.server, model, key, self.session.shown, self.session.meant)
+            self.panels[panel.module] = PanelView(self.server, model, key, self.session.shown, self.session.meant, self._poll)
         self._use_folder()
         self.views = ViewFollower(self.slicer)
         self.server.state.live, self.server.state.files, self.server.state.simulated = (
@@ -102,15 +102,19 @@ class WorkstationApp(TrameApp):
         """Bring the devices' news into the scene, and the scene's into the panels."""
         for turn in itertools.count():
             await asyncio.sleep(POLL_S)
-            self.budget.muted = not registered()  # where a tool is in the CT is not known yet, and it is not drawn
-            for name in (TRACKING, ULTRASOUND):
-                with contextlib.suppress(InputError):  # the logic keeps the reason and its panel shows it
-                    self.logics[name].poll()
-            self.budget.muted = False
+            self._poll()
             try:
                 self._turn(turn)
             except Exception:  # a read-out's defect must not end tracking
                 LOG.exception("the page could not be brought up to date")
+
+    def _poll(self) -> None:
+        """Take over what the devices have to say. Not drawn while a tool's place in the CT is not known."""
+        self.budget.muted = not registered()
+        for name in (TRACKING, ULTRASOUND):
+            with contextlib.suppress(InputError):  # the logic keeps the reason and its panel shows it
+                self.logics[name].poll()
+        self.budget.muted = False
 
     def _turn(self, turn: int) -> None:
         if turn % 2 == 0 and self.server.state.step == "navigation":

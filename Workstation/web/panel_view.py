@@ -23,9 +23,18 @@ SIGNS = "({ good: '✓ ', warning: '! ', bad: '✗ ', plain: '' })"
 class PanelView:
     """One panel in the page; `key` names its state variable and its events."""
 
-    def __init__(self, server: Any, model: PanelModel, key: str, shown: Translation = str, meant: Translation = str) -> None:
+    def __init__(
+        self,
+        server: Any,
+        model: PanelModel,
+        key: str,
+        shown: Translation = str,
+        meant: Translation = str,
+        before: Callable[[], object] = bool,
+    ) -> None:
         self.server, self.model, self.key = server, model, key
         self._shown, self._meant = shown, meant  # texts on their way to the page and back
+        self._before = before  # called before an action: what the devices have to say by now
         self._last = ""  # action whose message stands
         self.refresh()
         model.listen(self.refresh)
@@ -190,6 +199,7 @@ class PanelView:
 
     def _run(self, name: str) -> None:
         self._last = name
+        self._before()
         self.model.run(next(action for action in self.model.panel.actions() if action.name == name))
 
     def _field(self, name: str) -> Any:

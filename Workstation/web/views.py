@@ -18,7 +18,7 @@ POINTS = {  # role: (size of the glyphs in mm, whether labels are drawn)
     "PlausibilityPoints": (3.0, False),
 }
 TOOLS = {"Stylus": (0.902, 0.624, 0.0), "Probe": (0.337, 0.706, 0.914), "Sphere": (0.8, 0.475, 0.655)}
-DIVISIONS = (140, 140, 140)  # of the bone as drawn: cells of about 1.5 mm
+DIVISIONS = (110, 110, 110)  # of the bone as drawn: cells of about 2 mm
 TOOL_ATTRIBUTE = "CranioNav.ToolModel"
 # half the width of the tip, of the shaft, and the length, mm
 SHAPES = {"Stylus": (0.4, 4.0, 120.0), "Probe": (3.0, 9.0, 110.0), "Sphere": (2.0, 4.0, 100.0)}
@@ -84,7 +84,12 @@ class ViewFollower:
 
     def _style(self, role: str) -> None:
         node = scene.find(role)
-        if node is None or node.GetID() in self._styled or node.GetDisplayNode() is None:
+        if node is None or node.GetDisplayNode() is None:
+            return
+        visible = int(scene.role(role).parent == "" or registered())  # the patient's place is not known before
+        if node.GetDisplayNode().GetVisibility() != visible:
+            node.GetDisplayNode().SetVisibility(visible)
+        if node.GetID() in self._styled:
             return
         display, (size, labels) = node.GetDisplayNode(), POINTS[role]
         display.SetUseGlyphScale(False)
@@ -119,6 +124,7 @@ class ViewFollower:
         smooth = vtkPolyDataNormals()
         smooth.SetInputConnection(coarse.GetOutputPort())
         smooth.SplittingOff()
+        smooth.ConsistencyOff()  # the triangles are turned alike already
         smooth.Update()
         if self._bone is None or self._bone.GetScene() is None:
             self._bone = _model("Bone as drawn", scene.BONE)
