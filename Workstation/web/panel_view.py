@@ -102,10 +102,11 @@ class PanelView:
 
     def _draw_reading(self, item: ReadOut) -> None:
         reading = f"{self.key}.readings['{item.name}']"
+        unit = f"(/^[-–]?[0-9]/.test({reading}.text) ? ' {item.unit}' : '')"  # words have no unit
         with html.Div(classes="py-1"):
             html.Div(item.label, classes="text-caption text-medium-emphasis")
             html.Div(
-                f"{{{{ {SIGNS}[{reading}.level] + {reading}.text }}}} {item.unit}",
+                f"{{{{ {SIGNS}[{reading}.level] + {reading}.text + {unit} }}}}",
                 classes="text-h4 font-weight-medium" if item.large else "text-body-1",
                 style=(f"{{ color: {COLORS}[{reading}.level], lineHeight: 1.2 }}",),
                 raw_attrs=[f'data-reading="{item.name}"'],

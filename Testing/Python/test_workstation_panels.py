@@ -1,0 +1,126 @@
+"""One description, two faces: the web renderer draws all that a panel names, and its clicks do what Qt's do."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from typing import Any
+
+import numpy as np
+import pytest
+from CranioNavLib import host, scene_data
+from CranioNavLib.panel import Action, NodeField, ReadOut
+from CranioNavLib.panel_model import PanelModel
+from CranioNavLib.slicer_files import LabelledPoints
+
+os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
+pytest.importorskip("PySide6.QtWidgets", exc_type=ImportError)
+
+from Workstation.web.panel_view import PanelView
+
+MODULES = ("ModuleTracking", "ModuleUltrasound", "ModuleRegistration")
+
+
+@pytest.fixture
+def an_empty_scene():
+    host.scene().Clear(False)
+    yield host.scene()
+    host.scene().Clear(False)
+
+
+def drawn_in_the_web(name: str) -> tuple[PanelView, str]:
+    """A module's panel on a server of its own, and the page's template."""
+    from trame.app import get_server
+    from trame.ui.vuetify3 import VAppLayout
+
+    module = __import__(name)
+    server = get_server(f"panel-{uuid.uuid4()}", client_type="vue3")
+    view = PanelView(server, PanelModel(module.PANEL, getattr(module, f"{name}Logic")()), "panel")
+    with VAppLayout(server) as layout:
+        for step in module.PANEL.steps:
+            view.draw(step)
+    return view, layout.html
+
+
+def drawn_by_qt(name: str) -> Any:
+    """The same panel drawn by Qt."""
+    from CranioNavLib import panel_qt_widgets
+    from CranioNavLib.panel_qt import PanelWidget
+
+    qt, module = panel_qt_widgets.toolkit(), __import__(name)
+    app = qt.QApplication.instance() or qt.QApplication([])
+    parent = qt.QWidget()
+    drawn = PanelWidget(PanelModel(module.PANEL, getattr(module, f"{name}Logic")()), qt.QVBoxLayout(parent))
+    drawn.kept = (app, parent)
+    return drawn
+
+
+def click(view: PanelView, action: str) -> None:
+    """What the page sends when a button is pressed."""
+    view.server.controller.trigger_fn("panel_run")(action)
+
+
+def touch_landmarks() -> None:
+    planned = np.array([[0.0, 90, 0], [50, 60, 10], [-50, 60, 12], [0, 80, -40]])
+    scene_data.set_points("LandmarksCT", LabelledPoints(("a", "b", "c", "d"), planned))
+    scene_data.set_points("LandmarksPatient", LabelledPoints(("a", "b", "c", "d"), planned + (5.0, 6.0, 7.0)))
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_everything_described_is_drawn(an_empty_scene, name):
+    view, page = drawn_in_the_web(name)
+    for item in view.model.panel.items():
+        if isinstance(item, Action):
+            assert f'data-action="{item.name}"' in page
+        elif isinstance(item, ReadOut):
+            assert f'data-reading="{item.name}"' in page
+        elif isinstance(item, NodeField):
+            assert f"panel.nodes['{item.role}']" in page
+        else:
+            assert f'data-field="{item.name}"' in page
+
+
+def test_a_click_in_the_browser_does_what_a_click_in_qt_does(an_empty_scene):
+    found = []
+    for press in (
+        lambda: click(drawn_in_the_web("ModuleRegistration")[0], "registerLandmarks"),
+        lambda: drawn_by_qt("ModuleRegistration").buttons["registerLandmarks"].click(),
+    ):
+        an_empty_scene.Clear(False)
+        touch_landmarks()
+        press()
+        found.append((scene_data.get_transform("ReferenceToRas"), scene_data.get_table("Results")))
+    np.testing.assert_allclose(found[0][0][:3, 3], [-5, -6, -7], atol=1e-9)
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    assert found[0][1] == found[1][1]
+
+
+def test_an_edit_in_the_browser_reaches_the_scene(an_empty_scene):
+    view, _ = drawn_in_the_web("ModuleRegistration")
+    view.server.controller.trigger_fn("panel_change")("marker_diameter_mm", "6.5")
+    assert view.model.logic.parameters().read().marker_diameter_mm == 6.5
+    assert view.server.state.panel["fields"]["marker_diameter_mm"] == 6.5
+
+
+def test_a_refused_edit_is_said_at_its_field_and_changes_nothing(an_empty_scene):
+    view, _ = drawn_in_the_web("ModuleRegistration")
+    view.server.controller.trigger_fn("panel_change")("marker_diameter_mm", "600")
+    assert "expected 1" in view.server.state.panel["errors"]["marker_diameter_mm"]
+    assert view.model.logic.parameters().read().marker_diameter_mm == 4.0
+
+
+def test_a_blocked_action_says_why(an_empty_scene):
+    view, _ = drawn_in_the_web("ModuleRegistration")
+    click(view, "registerLandmarks")
+    assert "still missing" in view.server.state.panel["blocked"]["registerLandmarks"]
+    assert "still missing" in view.server.state.panel["message"]["text"]
+
+
+def test_a_folder_of_the_session_is_not_told_to_the_page(an_empty_scene, tmp_path):
+    from Workstation.web.session_folder import SessionFolder
+
+    session = SessionFolder(tmp_path / "here", list)
+    path = str(tmp_path / "here" / "palpation.igs.mha")
+    assert session.shown(f"recording into {path}") == "recording into session/palpation.igs.mha"
+    assert session.meant("session/palpation.igs.mha") == path
+    assert session.meant("/data/other.igs.mha") == "/data/other.igs.mha"
