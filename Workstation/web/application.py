@@ -111,7 +111,7 @@ class WorkstationApp(TrameApp):
     def _poll(self) -> None:
         """Take over what the devices have to say. Not drawn while a tool's place in the CT is not known."""
         self.budget.muted = not registered()
-        for name in (TRACKING, ULTRASOUND):
+        for name in (TRACKING, ULTRASOUND, HAND):
             with contextlib.suppress(InputError):  # the logic keeps the reason and its panel shows it
                 self.logics[name].poll()
         self.budget.muted = False
@@ -174,11 +174,13 @@ def _modules(session: SessionFolder, logics: dict[str, Any], go_to: Any) -> list
     from ModuleUltrasound import ModuleUltrasoundLogic
     from Workstation.web import navigation, session_panel, simulated_hand
 
+    ultrasound = ModuleUltrasoundLogic()
+    hand = simulated_hand.SimulatedHandLogic(ultrasound.nextPoint, lambda: len(ultrasound.taken()))
     return [
         (REGISTRATION_PANEL, ModuleRegistrationLogic()),
         (TRACKING_PANEL, ModuleTrackingLogic()),
-        (ULTRASOUND_PANEL, ModuleUltrasoundLogic()),
-        (simulated_hand.PANEL, simulated_hand.SimulatedHandLogic()),
+        (ULTRASOUND_PANEL, ultrasound),
+        (simulated_hand.PANEL, hand),
         (navigation.PANEL, navigation.NavigationLogic()),
         (session_panel.PANEL, SessionLogic(session, logics, go_to)),
     ]

@@ -22,6 +22,7 @@ html { overflow: hidden; }
 .v-application { font-size: 16px; }
 .step-sign { width: 26px; height: 26px; border-radius: 50%; border: 2px solid currentColor;
   text-align: center; line-height: 22px; font-weight: 700; }
+.in-sight { position: sticky; top: 0; z-index: 2; background: rgb(var(--v-theme-surface)); }
 .part { border-top: 1px solid rgba(255, 255, 255, 0.12); padding-top: 12px; margin-top: 12px; }
 """
 
@@ -75,7 +76,8 @@ class Page:
                 with html.Div(v_show=f"step === '{step.name}'", classes="pa-4", raw_attrs=[f'data-panel="{step.name}"']):
                     html.Div(f"{number}  {step.title}", classes="text-h6 mb-2")
                     self._draw_what_next(step, after)
-                    draw_live(step.name)
+                    with html.Div(classes="in-sight"):
+                        draw_live(step.name)
                     for module, name in step.parts:
                         view = self.panels[module]
                         only_simulated = module == HAND and name != "patient"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -14,13 +16,24 @@ from CranioNavLib.parameters import Limits, Parameters
 from CranioNavLib.scripted_module import ScriptedLoadableModuleLogic
 from CranioNavLib.slicer_files import LabelledPoints
 
+PATIENCE = 4.0  # dwell times on one point before it is left out
+
+
+@dataclass(frozen=True)
+class Visit:
+    """Where the palpating hand is."""
+
+    skipped: int  # points left out so far
+    point: int  # of the plan; -1: on its way
+    since_s: float
+
 
 @dataclass(frozen=True)
 class HandParameters(Parameters):
     """What the simulation keeps in the scene."""
 
     seed: Annotated[int, Limits(0, 2**31), "of the simulated patient and of every error"] = 0
-    dwell_s: Annotated[float, Limits(0.5, 20), "how long the hand stays on each palpation point"] = 2.5
+    dwell_s: Annotated[float, Limits(0.5, 20), "a point that is not taken in four times this is left out"] = 2.5
 
 
 PANEL = Panel(
@@ -52,7 +65,7 @@ PANEL = Panel(
         Step(
             "palpation",
             "Simulated hand",
-            "Let the simulated hand palpate the planned points one after another while the recording runs.",
+            "While the recording runs, let the simulated hand rest on each point that is asked for.",
             (ParameterField("dwell_s"), Action("palpateAll", "Hand: palpate all points")),
         ),
         Step(
@@ -76,6 +89,11 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
     parameterClass = HandParameters
     sessionRole = "SimulationSession"
+
+    def __init__(self, skip: Callable[[], object], taken: Callable[[], int]) -> None:
+        super().__init__()
+        self.skip, self.taken = skip, taken  # go on to the next point; how many are taken: the user's view of the screen
+        self._visit: Visit | None = None
 
     def layPatient(self) -> Task:
         """Make the patient and put his planning CT and planned points into the scene."""
@@ -135,8 +153,25 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         columns = scene_data.read_measurements(scene.find("ProtocolPoints"))
         normals = np.stack([columns[name] for name in ("Normal_R", "Normal_A", "Normal_S")], axis=1)
         session.set_plan(points.positions_mm, normals)
-        seconds = session.palpate_plan(self.parameters().read().dwell_s)
-        return f"the hand palpates {len(points)} points; it takes {seconds:.0f} s"
+        self._visit = Visit(0, -1, 0.0)
+        return f"the hand rests on each of {len(points)} points until it is taken"
+
+    def poll(self) -> None:
+        """While palpating: go where the protocol asks. A point that is not taken in time is left out."""
+        visit, node = self._visit, scene.find("Protocol")
+        session = running_simulation()
+        if visit is None or session is None or node is None:
+            return
+        now, asked, count = time.monotonic(), int(node.GetParameter("current") or 0), len(scene_data.get_points("ProtocolPoints"))
+        if self.taken() >= count or visit.skipped > count:
+            session.put_away("Probe")
+            self._visit = None
+        elif asked != visit.point:
+            session.hold_probe_at(asked)
+            self._visit = Visit(visit.skipped, asked, now)
+        elif now > visit.since_s + PATIENCE * self.parameters().read().dwell_s:
+            self.skip()
+            self._visit = Visit(visit.skipped + 1, -1, now)
 
     def measureTargets(self) -> str:
         """Digitise the targets as the sphere tool would, all at once."""
@@ -156,12 +191,17 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         return f"the stylus goes to {len(targets)} targets, one after another"
 
     def _session(self) -> Any:
-        from CranioNavLib.phantom.session import running_session
-
-        session = running_session()
+        session = running_simulation()
         if session is None:
             raise InputError("no simulated patient lies on the table; use one in step 1")
         return session
+
+
+def running_simulation() -> Any:
+    """The simulated session; None when there is none."""
+    from CranioNavLib.phantom.session import running_session
+
+    return running_session()
 
 
 def simulated_patient_of(seed: int, progress: Progress) -> tuple[Any, str]:
