@@ -10,11 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from CranioNavLib import host, scene_data
+from CranioNavLib.case import read_case
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import read_recording
 from CranioNavLib.slicer_files import LabelledPoints, load_scene, read_points, read_transform, write_points
+from ModuleRegistrationLib.procedure import register_case
 
 from Workstation.__main__ import run
+from Workstation.results import registration_record, write_registration
 
 pytestmark = pytest.mark.xdist_group("simulated case")
 
@@ -32,6 +35,11 @@ def registered(case: Path, out: Path, *options: str) -> dict:
     return record
 
 
+def computed(case: Path, mode: str, method: str | None = None) -> dict:
+    """The record alone, without the files and pictures that the command writes."""
+    return registration_record(register_case(read_case(case), mode, method))
+
+
 def refusal(capsys, case: Path, *options: str) -> str:
     assert run(["register", str(case), "-o", str(case / "out"), *options]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
@@ -39,10 +47,9 @@ def refusal(capsys, case: Path, *options: str) -> str:
     return lines[0]
 
 
-@pytest.mark.parametrize(("mode", "method"), [("IIa", "procrustes"), ("IIb", "cranionav"), ("III", "cranionav"), ("III", "icp")])
-def test_every_mode_registers_and_writes_exactly_the_agreed_keys(a_case, tmp_path, mode, method):
-    options = ["--mode", mode] + (["--method", method] if mode != "IIa" else [])
-    record = registered(a_case, tmp_path / "out", *options)
+@pytest.mark.parametrize(("mode", "method"), [("IIa", "procrustes"), ("IIb", "cranionav"), ("III", "icp")])
+def test_every_mode_gives_exactly_the_agreed_keys(a_case, mode, method):
+    record = computed(a_case, mode, None if mode == "IIa" else method)
     assert set(record) == KEYS
     assert (record["mode"], record["method"], record["case"]) == (mode, method, "case")
     assert len(record["predicted_tre_mm"]) == len(record["tre_mm"]) == 10
@@ -51,8 +58,11 @@ def test_every_mode_registers_and_writes_exactly_the_agreed_keys(a_case, tmp_pat
     assert record["tre_mean_mm"] < (8.0 if mode == "IIa" else 2.5)
 
 
-def test_transform_and_scene_give_the_matrix_of_the_record(a_case, tmp_path):
+def test_a_registered_case_leaves_record_transform_scene_and_report(a_case, tmp_path):
     record = registered(a_case, tmp_path / "out")
+    assert set(record) == KEYS
+    assert (record["mode"], record["method"]) == ("III", "cranionav")
+    assert record["tre_mean_mm"] < 2.5
     matrix = np.array(record["reference_to_ras"])
     np.testing.assert_allclose(read_transform(tmp_path / "out" / "ReferenceToRas.tfm"), matrix, atol=1e-9)
     load_scene(tmp_path / "out" / "scene.mrb")
@@ -60,10 +70,6 @@ def test_transform_and_scene_give_the_matrix_of_the_record(a_case, tmp_path):
     assert len(scene_data.get_bone_points()) >= 12
     node = host.scene().GetFirstNodeByName("SurfacePoints")
     assert node.GetParentTransformNode().GetName() == "ReferenceToRas"
-
-
-def test_the_report_holds_everything_in_itself(a_case, tmp_path):
-    registered(a_case, tmp_path / "out", "--mode", "III")
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 4
     assert re.findall(r'(?:src|href)="(?!data:)', page) == []
@@ -71,9 +77,8 @@ def test_the_report_holds_everything_in_itself(a_case, tmp_path):
 
 
 def test_the_error_of_a_transform_is_the_same_when_evaluated_alone(a_case, tmp_path, capsys):
-    record = registered(a_case, tmp_path / "out", "--mode", "IIb")
-    capsys.readouterr()
-    arguments = ["--transform", tmp_path / "out" / "ReferenceToRas.tfm", "--targets-ct", a_case / "targets-ct.mrk.json",
+    record = write_registration(register_case(read_case(a_case), "IIb"), tmp_path)
+    arguments = ["--transform", tmp_path / "ReferenceToRas.tfm", "--targets-ct", a_case / "targets-ct.mrk.json",
                  "--targets-patient", a_case / "targets-patient.mrk.json", "--json"]  # fmt: skip
     assert run(["evaluate", *map(str, arguments)]) == 0
     alone = json.loads(capsys.readouterr().out)
@@ -96,24 +101,24 @@ def test_a_batch_goes_on_past_a_case_that_fails(a_case, tmp_path, capsys):
     assert not (out / "case" / "scene.mrb").exists()
 
 
-def test_renamed_landmarks_pair_by_order_and_shuffled_ones_by_label(a_case, tmp_path):
-    before = registered(a_case, tmp_path / "before", "--mode", "IIa")
+def test_renamed_landmarks_pair_by_order_and_shuffled_ones_by_label(a_case):
+    before = computed(a_case, "IIa")
     patient = read_points(a_case / "landmarks-patient.mrk.json")
     renamed = LabelledPoints(tuple(f"F-{index}" for index in range(len(patient))), patient.positions_mm)
     write_points(a_case / "landmarks-patient.mrk.json", renamed)
-    by_order = registered(a_case, tmp_path / "order", "--mode", "IIa")
+    by_order = computed(a_case, "IIa")
     shuffled = LabelledPoints(patient.labels[::-1], patient.positions_mm[::-1])
     write_points(a_case / "landmarks-patient.mrk.json", shuffled)
-    by_label = registered(a_case, tmp_path / "label", "--mode", "IIa")
+    by_label = computed(a_case, "IIa")
     for other in (by_order, by_label):
         np.testing.assert_allclose(other["reference_to_ras"], before["reference_to_ras"], atol=1e-9)
 
 
-def test_an_oblique_ct_gives_the_same_registration(a_case, tmp_path):
+def test_an_oblique_ct_gives_the_same_registration(a_case):
     """The CT's voxels on a tilted grid, its anatomy where it was: only the resampling may be felt."""
     import SimpleITK as sitk
 
-    before = registered(a_case, tmp_path / "before", "--mode", "IIb")
+    before = computed(a_case, "IIb")
     image = sitk.ReadImage(json.loads((a_case / "case.json").read_text())["ct"])
     turn = rigid_from_vector([0.15, -0.1, 0.2], [0, 0, 0])[:3, :3]
     spacing, size = np.array([0.8, 0.8, 1.6]), np.array([300, 330, 150])
@@ -125,7 +130,7 @@ def test_an_oblique_ct_gives_the_same_registration(a_case, tmp_path):
     oblique = sitk.Resample(image, grid, sitk.Transform(), sitk.sitkLinear, -1024)
     sitk.WriteImage(oblique, str(a_case / "ct.nii.gz"))
     (a_case / "case.json").unlink()
-    after = registered(a_case, tmp_path / "after", "--mode", "IIb")
+    after = computed(a_case, "IIb")
     assert after["tre_mean_mm"] == pytest.approx(before["tre_mean_mm"], abs=0.6)
 
 

@@ -12,6 +12,8 @@ ROOT = Path(__file__).parents[3]
 MAY_USE_THE_PHANTOM = {
     "ModuleTracking/ModuleTrackingLib/plugins/simulated.py",
     "ModuleUltrasound/ModuleUltrasoundLib/plugins/simulated.py",
+    "ModuleTracking/ModuleTrackingLib/ndi/emulator/patient.py",
+    "ModuleRegistration/ModuleRegistrationLib/verification/simulated_patient.py",
     "ModuleUltrasound/ModuleUltrasoundLib/emulators/line_source.py",
     "ModuleRegistration/ModuleRegistrationLib/verification/studies.py",
     "ModuleRegistration/ModuleRegistrationLib/verification/study_figure.py",
