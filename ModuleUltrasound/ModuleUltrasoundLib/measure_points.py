@@ -21,16 +21,35 @@ MEDIAN_TO_SD = 1.4826
 class Lines(Protocol):
     """What bone points are made from (see LineMeasurements)."""
 
-    depths_mm: Array
-    positions_mm: Array
-    covariances_mm2: Array
-    beam_directions: Array
-    qualities: Array
-    accepted: npt.NDArray[np.bool_]
-    alternative_depths_mm: Array
-    alternative_probabilities: Array
-    speed_of_sound_m_s: float
-    speed_of_sound_sd_m_s: float
+    @property
+    def depths_mm(self) -> Array: ...
+
+    @property
+    def positions_mm(self) -> Array: ...
+
+    @property
+    def covariances_mm2(self) -> Array: ...
+
+    @property
+    def beam_directions(self) -> Array: ...
+
+    @property
+    def qualities(self) -> Array: ...
+
+    @property
+    def accepted(self) -> npt.NDArray[np.bool_]: ...
+
+    @property
+    def alternative_depths_mm(self) -> Array: ...
+
+    @property
+    def alternative_probabilities(self) -> Array: ...
+
+    @property
+    def speed_of_sound_m_s(self) -> float: ...
+
+    @property
+    def speed_of_sound_sd_m_s(self) -> float: ...
 
 
 def bone_points(recording: Recording, measurements: Lines) -> BonePoints:

@@ -116,12 +116,6 @@ def _describe(kind: type[Parameters]) -> tuple[ParameterInfo, ...]:
     return tuple(_describe_field(field, hints[field.name]) for field in dataclasses.fields(kind))
 
 
-@functools.cache
-def _describe(kind: type[Parameters]) -> tuple[ParameterInfo, ...]:
-    hints = get_type_hints(kind, include_extras=True)
-    return tuple(_describe_field(field, hints[field.name]) for field in dataclasses.fields(kind))
-
-
 def _describe_field(field: dataclasses.Field[Any], hint: Any) -> ParameterInfo:
     extras: tuple[Any, ...] = ()
     if get_origin(hint) is Annotated:
