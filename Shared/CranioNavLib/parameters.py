@@ -82,7 +82,7 @@ class Parameters:
     @classmethod
     def describe(cls) -> tuple[ParameterInfo, ...]:
         """One ParameterInfo a field, in order."""
-        return _describe(cls)
+        return _describe(cls)  # type: ignore[arg-type]  # a class is hashable, whatever its instances are
 
     @classmethod
     def from_strings(cls: type[P], values: dict[str, str]) -> P:
