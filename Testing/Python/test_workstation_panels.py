@@ -124,3 +124,22 @@ def test_a_folder_of_the_session_is_not_told_to_the_page(an_empty_scene, tmp_pat
     assert session.shown(f"recording into {path}") == "recording into session/palpation.igs.mha"
     assert session.meant("session/palpation.igs.mha") == path
     assert session.meant("/data/other.igs.mha") == "/data/other.igs.mha"
+
+
+def test_a_point_added_to_a_list_is_saved(an_empty_scene, tmp_path):
+    from CranioNavLib import scene
+    from CranioNavLib.slicer_files import add_points, read_points
+    from CranioNavLib.volume import Volume
+
+    from Workstation.web.session_folder import SessionFolder
+
+    session = SessionFolder(tmp_path, list)
+    scene_data.set_volume("CT", Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), "nothing"))
+    touch_landmarks()
+    session.save("landmarks")
+    add_points(scene.find("LandmarksPatient"), LabelledPoints(("e",), np.array([[1.0, 2, 3]])))
+    session.save("landmarks")
+    assert read_points(tmp_path / "landmarks-patient.mrk.json").labels == ("a", "b", "c", "d", "e")
+    scene.release("LandmarksPatient")
+    session.save("landmarks")
+    assert not (tmp_path / "landmarks-patient.mrk.json").exists()

@@ -175,7 +175,9 @@ def _modules(session: SessionFolder, logics: dict[str, Any], go_to: Any) -> list
     from Workstation.web import navigation, session_panel, simulated_hand
 
     ultrasound = ModuleUltrasoundLogic()
-    hand = simulated_hand.SimulatedHandLogic(ultrasound.nextPoint, lambda: len(ultrasound.taken()))
+    hand = simulated_hand.SimulatedHandLogic(
+        ultrasound.nextPoint, lambda: len(ultrasound.taken()) if ultrasound.recorded() else None
+    )
     return [
         (REGISTRATION_PANEL, ModuleRegistrationLogic()),
         (TRACKING_PANEL, ModuleTrackingLogic()),

@@ -78,11 +78,9 @@ def progress(logic: Any) -> list[dict[str, Any]]:
     node = scene.find("ProtocolPoints")
     if node is None:
         return []
+    if logic.recorded() is None and scene.find("SurfacePoints") is not None:
+        return []  # palpated and measured
     taken, current = set(logic.taken()), logic.currentIndex()
-    measured = scene.find("SurfacePoints")
-    if not taken and measured is not None:
-        names = [measured.GetNthControlPointLabel(index) for index in range(measured.GetNumberOfControlPoints())]
-        taken = set(names)
     labels = [node.GetNthControlPointLabel(index) for index in range(node.GetNumberOfControlPoints())]
     return [
         {"label": label, "state": "taken" if label in taken else "now" if index == current else "open"}

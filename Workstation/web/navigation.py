@@ -38,7 +38,7 @@ PANEL = Panel(
                 ParameterField("ring", "Ring of the 95% error"),
                 ReadOut("leadingTool", "Tool"),
                 ReadOut("boneDistance", "To the bone", "mm", large=True),
-                ReadOut("nearestTarget", "To the nearest target", "mm", large=True),
+                ReadOut("nearestTarget", "To the nearest target", large=True),
                 ReadOut("expectedError", "Error here, 95%", "mm", large=True),
                 ReadOut("position", "Tip, RAS", "mm"),
             ),
@@ -103,7 +103,7 @@ class NavigationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
             return None
         targets = scene_data.get_points("TargetsCT")
         distances = np.linalg.norm(targets.positions_mm - found[1], axis=1)
-        return Reading(f"{targets.labels[int(np.argmin(distances))]}: {distances.min():.1f}")
+        return Reading(f"{targets.labels[int(np.argmin(distances))]}: {distances.min():.1f} mm")
 
     def expectedError(self) -> Reading | None:
         """The predicted 95% error at the tip."""

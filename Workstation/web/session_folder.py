@@ -52,7 +52,7 @@ class SessionFolder:
     def __init__(self, folder: Path, parameter_nodes: Callable[[], Iterable[Any]]) -> None:
         self.folder, self._parameter_nodes = Path(folder), parameter_nodes
         self.simulated_seed: int | None = None
-        self._stamps: dict[str, int] = {}
+        self._written: dict[str, str] = {}
         self._ct_image: Any = None
         self._state = ""
 
@@ -97,14 +97,18 @@ class SessionFolder:
 
     def _save_list(self, role: str, path: Path | None) -> None:
         node = scene.find(role)
-        stamp = node.GetMTime() if node is not None else 0
-        if path is None or self._stamps.get(role, 0) == stamp:
+        empty = node is None or not node.GetNumberOfControlPoints()
+        points = None if empty else scene_data.get_points(role)
+        content = (
+            "" if points is None else f"{points.labels}{points.positions_mm.tobytes().hex()}"
+        )  # a new point leaves MTime alone
+        if path is None or self._written.get(role, "") == content:
             return
-        self._stamps[role] = stamp
-        if node is None or not node.GetNumberOfControlPoints():
+        self._written[role] = content
+        if points is None:
             path.unlink(missing_ok=True)
-            return
-        write_points(path, scene_data.get_points(role), role)
+        else:
+            write_points(path, points, role)
 
     def _collect(self, step: str) -> dict[str, Any]:
         registration = scene.find("ReferenceToRas")

@@ -90,9 +90,9 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
     parameterClass = HandParameters
     sessionRole = "SimulationSession"
 
-    def __init__(self, skip: Callable[[], object], taken: Callable[[], int]) -> None:
+    def __init__(self, skip: Callable[[], object], taken: Callable[[], int | None]) -> None:
         super().__init__()
-        self.skip, self.taken = skip, taken  # go on to the next point; how many are taken: the user's view of the screen
+        self.skip, self.taken = skip, taken  # go on to the next point; how many are taken; None: not recording
         self._visit: Visit | None = None
 
     def layPatient(self) -> Task:
@@ -153,6 +153,9 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         columns = scene_data.read_measurements(scene.find("ProtocolPoints"))
         normals = np.stack([columns[name] for name in ("Normal_R", "Normal_A", "Normal_S")], axis=1)
         session.set_plan(points.positions_mm, normals)
+        if self.taken() is None:
+            raise InputError("nothing is recorded yet; press Record first")
+        session.put_away("Stylus")
         self._visit = Visit(0, -1, 0.0)
         return f"the hand rests on each of {len(points)} points until it is taken"
 
@@ -163,7 +166,8 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         if visit is None or session is None or node is None:
             return
         now, asked, count = time.monotonic(), int(node.GetParameter("current") or 0), len(scene_data.get_points("ProtocolPoints"))
-        if self.taken() >= count or visit.skipped > count:
+        taken = self.taken()
+        if taken is None or taken >= count or visit.skipped > count:
             session.put_away("Probe")
             self._visit = None
         elif asked != visit.point:
