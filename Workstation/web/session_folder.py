@@ -54,6 +54,7 @@ class SessionFolder:
         self.simulated_seed: int | None = None
         self._written: dict[str, str] = {}
         self._ct_image: Any = None
+        self._ct_pending = False  # the CT is not in the folder yet: nothing to go on from
         self._state = ""
 
     @property
@@ -75,7 +76,7 @@ class SessionFolder:
         node = scene.find("CT")
         if node is None or node.GetImageData() is None or node.GetImageData() is self._ct_image:
             return None
-        self._ct_image = node.GetImageData()
+        self._ct_image, self._ct_pending = node.GetImageData(), True
         return scene_data.get_volume("CT")
 
     def write_ct(self, volume: Any) -> None:
@@ -83,12 +84,13 @@ class SessionFolder:
         from CranioNavLib.phantom.case_writer import write_volume
 
         write_volume(output_folder(self.folder) / "ct.nrrd", volume)
+        self._ct_pending = False
 
     def save(self, step: str) -> None:
         """Write the lists and the state, where they changed. Main thread only."""
         for role, name in LISTS.items():
             self._save_list(role, output_folder(self.folder) / name if scene.find("CT") is not None else None)
-        if scene.find("CT") is None:
+        if scene.find("CT") is None or self._ct_pending:
             return
         state = json.dumps(self._collect(step), indent=1)
         if state != self._state:

@@ -53,7 +53,7 @@ PANEL = Panel(
         Step(
             "pivot",
             "Simulated hand",
-            "Let the simulated hand pivot the stylus about a divot on the clamp, then press Pivot above.",
+            "Let the simulated hand pivot the stylus about a divot on the clamp, then press Pivot below.",
             (Action("pivotStylus", "Hand: pivot the stylus"), Action("putAway", "Hand: put the tools away")),
         ),
         Step(
