@@ -22,7 +22,7 @@ html { overflow: hidden; }
 .v-application { font-size: 16px; }
 .step-sign { width: 26px; height: 26px; border-radius: 50%; border: 2px solid currentColor;
   text-align: center; line-height: 22px; font-weight: 700; }
-.in-sight { position: sticky; top: 0; z-index: 2; background: rgb(var(--v-theme-surface)); }
+.in-sight { position: sticky; top: 0; z-index: 2; padding-top: 10px; background: rgb(var(--v-theme-surface)); }
 .part { border-top: 1px solid rgba(255, 255, 255, 0.12); padding-top: 12px; margin-top: 12px; }
 """
 
