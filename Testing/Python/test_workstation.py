@@ -115,6 +115,7 @@ def test_the_whole_procedure_is_done_by_clicks(tmp_path, pictures):
 
 
 @needs_browser
+@pytest.mark.slow
 def test_a_killed_session_goes_on_where_it_was(tmp_path):
     folder = tmp_path / "session"
     with browsing() as user:
