@@ -5,10 +5,10 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import dataclass
 from enum import Enum
-from types import TracebackType
 from typing import Optional
 
-from CranioNavLib.plugins import Plugin, PluginKind
+from CranioNavLib.device_plugin import DevicePlugin
+from CranioNavLib.plugins import PluginKind
 from CranioNavLib.rigid import Array
 
 
@@ -51,7 +51,7 @@ class ToolInfo:
     detail: str = ""
 
 
-class Tracker(Plugin):
+class Tracker(DevicePlugin):
     """Base of tracker plugins. `with tracker:` opens, starts and always closes.
 
     All methods are called from one thread. They raise `TrackerError` for what the device does and
@@ -59,44 +59,13 @@ class Tracker(Plugin):
     """
 
     @abstractmethod
-    def open(self) -> None:
-        """Connect and set the device up."""
-
-    @abstractmethod
-    def start(self) -> None:
-        """Begin tracking."""
-
-    @abstractmethod
     def read(self, timeout_s: float = 1.0) -> list[ToolPose]:
         """The next frame: one ToolPose for every tool, missing ones included; empty if none came in time."""
-
-    @abstractmethod
-    def stop(self) -> None:
-        """End tracking; may be called twice."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Let go of the device; may be called twice, and after a failure."""
 
     @property
     @abstractmethod
     def tools(self) -> list[ToolInfo]:
         """The tools known after `open`."""
-
-    def __enter__(self) -> Tracker:
-        try:
-            self.open()
-            self.start()
-        except BaseException:
-            self.close()
-            raise
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        try:
-            self.stop()
-        finally:
-            self.close()
 
 
 class TrackerError(RuntimeError):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Optional
 
 import numpy as np
 import numpy.typing as npt
-from CranioNavLib.plugins import Plugin, PluginKind
+from CranioNavLib.device_plugin import DevicePlugin
+from CranioNavLib.plugins import PluginKind
 from CranioNavLib.sequence_metafile import Acquisition
 
 
@@ -28,7 +28,7 @@ class DeviceError(RuntimeError):
     """The pulser/receiver failed or was lost; the message says what happened and what to do."""
 
 
-class AModeDevice(Plugin):
+class AModeDevice(DevicePlugin):
     """Base of A-mode device plugins. `with device:` opens, starts and always closes.
 
     All methods are called from one thread. They raise `DeviceError` for what the device does and
@@ -36,44 +36,13 @@ class AModeDevice(Plugin):
     """
 
     @abstractmethod
-    def open(self) -> None:
-        """Connect and set the device up."""
-
-    @abstractmethod
-    def start(self) -> None:
-        """Begin to take lines."""
-
-    @abstractmethod
     def read(self, timeout_s: float = 1.0) -> Optional[RfLine]:
         """The next line, or None if none came in time."""
-
-    @abstractmethod
-    def stop(self) -> None:
-        """End taking lines; may be called twice."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Let go of the device; may be called twice, and after a failure."""
 
     @property
     @abstractmethod
     def acquisition(self) -> Acquisition:
         """Sampling rate, transducer frequency and forerun of the lines; known after `open`."""
-
-    def __enter__(self) -> AModeDevice:
-        try:
-            self.open()
-            self.start()
-        except BaseException:
-            self.close()
-            raise
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        try:
-            self.stop()
-        finally:
-            self.close()
 
 
 AMODE_DEVICES: PluginKind[AModeDevice] = PluginKind("amode", AModeDevice, folder="ModuleUltrasoundLib.plugins")  # type: ignore[type-abstract]
