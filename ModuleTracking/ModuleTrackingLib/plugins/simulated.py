@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 from typing import Annotated, Optional
 
 import numpy as np
 from CranioNavLib.errors import InputError
 from CranioNavLib.parameters import Limits, Parameters
-from CranioNavLib.phantom.session import TOOLS, SimulatedSession, current_session
+from CranioNavLib.phantom.session import TOOLS, SimulatedSession
+from CranioNavLib.phantom.simulated_device import Head, SimulatedDevice
 
 from ModuleTrackingLib.tracker import TRACKERS, PoseStatus, ToolInfo, ToolPose, Tracker, TrackerError
-
-
-class Head(str, Enum):
-    """Which head lies on the simulated table, if no session runs yet."""
-
-    SAMPLE = "sample"
-    SYNTHETIC = "synthetic"
 
 
 @dataclass(frozen=True)
@@ -34,12 +27,13 @@ class SimulatedTrackerSettings(Parameters):
 
 
 @TRACKERS.register
-class SimulatedTracker(Tracker):
+class SimulatedTracker(SimulatedDevice, Tracker):
     """The tracker of the simulated session (see CranioNavLib.phantom.session)."""
 
     name = "simulated"
     title = "Simulated optical tracker and patient"
     Settings = SimulatedTrackerSettings
+    device, idle, failure = "simulated tracker", "is not tracking", TrackerError
 
     def __init__(self, settings: Optional[Parameters] = None) -> None:
         super().__init__(settings)
@@ -47,32 +41,7 @@ class SimulatedTracker(Tracker):
         unknown = self._hidden - set(TOOLS)
         if unknown:
             raise InputError(f"parameter missing_tools: no tool {', '.join(sorted(unknown))}; tools are {', '.join(TOOLS)}")
-        self._session: Optional[SimulatedSession] = None
         self._rng = np.random.default_rng([self.settings.seed, 0x7C])
-        self._begin_s: Optional[float] = None  # not None: tracking
-        self._frame = 0
-
-    def open(self) -> None:
-        """Join the simulated session.
-
-        Raises
-        ------
-        InputError
-            The sample head is wanted and cannot be had.
-        """
-        self._session = current_session(self.settings.head.value, self.settings.seed)
-
-    def start(self) -> None:
-        """Begin tracking.
-
-        Raises
-        ------
-        TrackerError
-            It is not open.
-        """
-        if self._session is None:
-            raise TrackerError("the simulated tracker is not open; open it first")
-        self._begin_s, self._frame = self._session.clock.now(), 0
 
     def read(self, timeout_s: float = 1.0) -> list[ToolPose]:
         """The next frame, when it is due.
@@ -82,38 +51,16 @@ class SimulatedTracker(Tracker):
         TrackerError
             It was not started, or the simulated link broke.
         """
-        if self._session is None or self._begin_s is None:
-            raise TrackerError("the simulated tracker is not tracking; start it first")
-        clock, period = self._session.clock, 1 / self.settings.rate_hz
-        limit = self.settings.fail_after_s
-        if limit is not None and clock.now() - self._begin_s >= limit:
-            raise TrackerError("the link to the simulated tracker broke; open it again")
-        # frames that nobody fetched in time are gone, as with a real device
-        self._frame = max(self._frame + 1, int(np.ceil((clock.now() - self._begin_s) / period - 1e-6)))
-        due = self._begin_s + self._frame * period
-        if due - clock.now() > timeout_s:
-            clock.wait_until(clock.now() + timeout_s)
-            self._frame -= 1
-            return []
-        clock.wait_until(due)
-        return self._poses(self._session, due)
-
-    def stop(self) -> None:
-        """End tracking."""
-        self._begin_s = None
-
-    def close(self) -> None:
-        """Leave the session; it goes on for the other simulated device."""
-        self._begin_s = self._session = None
+        session, begin_s = self._started()
+        due = self._await_next(timeout_s)
+        return [] if due is None else self._poses(session, due, due - begin_s)
 
     @property
     def tools(self) -> list[ToolInfo]:
         return [] if self._session is None else [ToolInfo(name, "simulated", f"S-{name}", "simulated") for name in TOOLS]
 
-    def _poses(self, session: SimulatedSession, time_s: float) -> list[ToolPose]:
-        assert self._begin_s is not None
+    def _poses(self, session: SimulatedSession, time_s: float, device_s: float) -> list[ToolPose]:
         seen = session.reported_poses(time_s, self.settings.noise, self.settings.calibrated)
-        device_s = time_s - self._begin_s
         poses = []
         for name in TOOLS:
             pose = seen[name]
@@ -121,5 +68,5 @@ class SimulatedTracker(Tracker):
                 pose = None
             status = PoseStatus.OK if pose is not None else PoseStatus.MISSING
             flags = () if pose is not None else ("not seen by the camera",)
-            poses.append(ToolPose(name, pose, status, time_s, device_s, self._frame, float("nan"), flags))
+            poses.append(ToolPose(name, pose, status, time_s, device_s, self._number, float("nan"), flags))
         return poses

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 from typing import Annotated, Optional
 
 import numpy as np
 import numpy.typing as npt
 from CranioNavLib.parameters import Limits, Parameters
-from CranioNavLib.phantom.session import SimulatedSession, current_session
+from CranioNavLib.phantom.session import SimulatedSession
+from CranioNavLib.phantom.simulated_device import Head, SimulatedDevice
 from CranioNavLib.sequence_metafile import Acquisition
 
 from ModuleUltrasoundLib.device import AMODE_DEVICES, AModeDevice, DeviceError, RfLine
-
-
-class Head(str, Enum):
-    """Which head lies on the simulated table, if no session runs yet."""
-
-    SAMPLE = "sample"
-    SYNTHETIC = "synthetic"
 
 
 @dataclass(frozen=True)
@@ -32,41 +25,17 @@ class SimulatedAModeSettings(Parameters):
 
 
 @AMODE_DEVICES.register
-class SimulatedAMode(AModeDevice):
+class SimulatedAMode(SimulatedDevice, AModeDevice):
     """The probe of the simulated session (see CranioNavLib.phantom.session)."""
 
     name = "simulated"
     title = "Simulated A-mode probe on the simulated patient"
     Settings = SimulatedAModeSettings
+    device, idle, failure = "simulated probe", "takes no lines", DeviceError
 
     def __init__(self, settings: Optional[Parameters] = None) -> None:
         super().__init__(settings)
-        self._session: Optional[SimulatedSession] = None
         self._rng = np.random.default_rng([self.settings.seed, 0x7D])
-        self._begin_s: Optional[float] = None  # not None: lines are taken
-        self._line = 0
-
-    def open(self) -> None:
-        """Join the simulated session.
-
-        Raises
-        ------
-        InputError
-            The sample head is wanted and cannot be had.
-        """
-        self._session = current_session(self.settings.head.value, self.settings.seed)
-
-    def start(self) -> None:
-        """Begin to take lines.
-
-        Raises
-        ------
-        DeviceError
-            It is not open.
-        """
-        if self._session is None:
-            raise DeviceError("the simulated probe is not open; open it first")
-        self._begin_s, self._line = self._session.clock.now(), 0
 
     def read(self, timeout_s: float = 1.0) -> Optional[RfLine]:
         """The next line, when it is due.
@@ -76,31 +45,15 @@ class SimulatedAMode(AModeDevice):
         DeviceError
             It was not started, or the simulated link broke.
         """
-        if self._session is None or self._begin_s is None:
-            raise DeviceError("the simulated probe takes no lines; start it first")
-        clock, period = self._session.clock, 1 / self.settings.rate_hz
-        limit = self.settings.fail_after_s
-        if limit is not None and clock.now() - self._begin_s >= limit:
-            raise DeviceError("the link to the simulated probe broke; open it again")
-        self._line = max(self._line + 1, int(np.ceil((clock.now() - self._begin_s) / period - 1e-6)))
+        session, _ = self._started()
+        lost = 0
         while self._rng.random() < self.settings.lost_share:
-            self._line += 1
-        due = self._begin_s + self._line * period
-        if due - clock.now() > timeout_s:
-            clock.wait_until(clock.now() + timeout_s)
-            self._line -= 1
+            lost += 1
+        due = self._await_next(timeout_s, lost)
+        if due is None:
             return None
-        clock.wait_until(due)
-        samples = self._session.rf_line(due)
-        return RfLine(samples, due, self._line, self._saturated(samples))
-
-    def stop(self) -> None:
-        """End taking lines."""
-        self._begin_s = None
-
-    def close(self) -> None:
-        """Leave the session; it goes on for the other simulated device."""
-        self._begin_s = self._session = None
+        samples = session.rf_line(due)
+        return RfLine(samples, due, self._number, self._saturated(samples))
 
     def _saturated(self, samples: npt.NDArray[np.int16]) -> bool:
         """Whether an echo stands at the end of the converter's range; the main bang always does and is left out."""
@@ -111,6 +64,4 @@ class SimulatedAMode(AModeDevice):
 
     @property
     def acquisition(self) -> Acquisition:
-        if self._session is None:
-            raise DeviceError("the simulated probe is not open; open it first")
-        return self._session.acquisition
+        return self._joined().acquisition
