@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from CranioNavLib import host, scene, scene_data
 
+from Workstation.web.framing import Framing
+
 POINTS = {  # role: (size of the glyphs in mm, whether labels are drawn)
     "LandmarksCT": (6.0, False),
     "LandmarksPatient": (5.0, False),
@@ -29,20 +31,23 @@ class ViewFollower:
 
     def __init__(self, slicer_app: Any) -> None:
         self._app = slicer_app
-        self._shown: dict[str, tuple[str, int]] = {}
+        self._framing = Framing(slicer_app.view_manager, self._bounds)
+        self._shown: dict[str, tuple[str, Any]] = {}
         self._styled: set[str] = set()
         self._tools: dict[str, Any] = {}
+        self._foreruns: dict[str, float] = {}
         self._bone: Any = None
         self._ring: tuple[Any, float] = (None, 0.0)
 
-    def refresh(self) -> None:
-        """Show what is new. Main thread only."""
+    def refresh(self, forerun_mm: float = 0.0) -> None:
+        """Show what is new; `forerun_mm` is the length of the probe's delay line. Main thread only."""
         if self._is_new("CT", lambda node: node.GetImageData()):
             self._app.display_manager.show_volume_in_slice_background(scene.find("CT"))
             self._app.display_manager.reset_views()
+            self._framing.fit()
         if self._is_new("Bone", lambda node: node.GetPolyData()):
             self._show_bone(scene.find("Bone"))
-            self._app.display_manager.reset_views()
+            self._framing.fit()
         if self._is_new("OuterTable", lambda node: node.GetPolyData()):
             scene.find("OuterTable").GetDisplayNode().SetVisibility(False)  # it lies on Bone: drawing both shows nothing more
         if scene.find("Bone") is None and self._bone is not None and self._bone.GetScene() is not None:
@@ -50,7 +55,8 @@ class ViewFollower:
         for role in POINTS:
             self._style(role)
         for tool in TOOLS:
-            self._show_tool(tool)
+            self._show_tool(tool, forerun_mm if tool == "Probe" else 0.0)
+        self._framing.keep()
 
     def follow(self, tip_ras_mm: Any) -> None:
         """Let all slices pass through a point."""
@@ -100,16 +106,18 @@ class ViewFollower:
         node.SetLocked(role != "LandmarksCT")
         self._styled.add(node.GetID())
 
-    def _show_tool(self, tool: str) -> None:
+    def _show_tool(self, tool: str, forerun_mm: float) -> None:
         pose = scene_data.get_pose(f"{tool}ToReference")
         node = self._tools.get(tool)
         if node is None or node.GetScene() is None:
             if pose.matrix is None or not registered():
                 return
             node = self._tools[tool] = _model(f"{tool} model", TOOLS[tool])
-            node.SetAndObservePolyData(_tool_shape(*SHAPES[tool]))
             node.SetAttribute(TOOL_ATTRIBUTE, tool)
             node.SetAndObserveTransformNodeID(scene.find(f"{tool}ToReference").GetID())
+        if node.GetPolyData() is None or self._foreruns.get(tool) != forerun_mm:
+            node.SetAndObservePolyData(_tool_shape(*SHAPES[tool], forerun_mm))
+            self._foreruns[tool] = forerun_mm
         display, visible = node.GetDisplayNode(), int(pose.matrix is not None and registered())
         if display.GetVisibility() != visible:
             display.SetVisibility(visible)
@@ -134,10 +142,16 @@ class ViewFollower:
     def _is_new(self, role: str, content: Any) -> bool:
         node = scene.find(role)
         data = content(node) if node is not None else None
-        key = (node.GetID(), id(data)) if data is not None else ("", 0)
-        changed = self._shown.get(role) != key
-        self._shown[role] = key
-        return changed and data is not None
+        node_id, before = self._shown.get(role, ("", None))
+        # held, not only named: VTK's wrappers of data that nobody holds are made anew, with another id
+        self._shown[role] = (node.GetID() if data is not None else "", data)
+        return data is not None and (data is not before or node.GetID() != node_id)
+
+    def _bounds(self) -> tuple[float, ...] | None:
+        """What the 3-D view is to show: the skull. Points lie on it, and tools come and go."""
+        if self._bone is None or self._bone.GetScene() is None or not self._bone.GetPolyData().GetNumberOfPoints():
+            return None
+        return tuple(self._bone.GetPolyData().GetBounds())
 
 
 def registered() -> bool:
@@ -155,8 +169,8 @@ def _model(name: str, color: tuple[float, float, float]) -> Any:
     return node
 
 
-def _tool_shape(tip_mm: float, shaft_mm: float, length_mm: float) -> Any:
-    """A shaft that narrows to its tip at the origin; the tool's +z points out of the tip."""
+def _tool_shape(tip_mm: float, shaft_mm: float, length_mm: float, forerun_mm: float) -> Any:
+    """A shaft that narrows to its tip at the origin, and a forerun in front of it; the tool's +z points out of the tip."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
@@ -164,7 +178,7 @@ def _tool_shape(tip_mm: float, shaft_mm: float, length_mm: float) -> Any:
     sides = 16
     angles = np.arange(sides) * 2 * np.pi / sides
     circle = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(sides)])
-    rings = [(tip_mm, 0.0), (shaft_mm, -25.0), (shaft_mm, -length_mm)]
+    rings = [(tip_mm, forerun_mm)] * (forerun_mm > 0) + [(tip_mm, 0.0), (shaft_mm, -25.0), (shaft_mm, -length_mm)]
     rows = np.concatenate([circle * radius + (0.0, 0.0, height) for radius, height in rings])
     points, cells, mesh = vtkPoints(), vtkCellArray(), vtkPolyData()
     points.SetData(numpy_to_vtk(np.ascontiguousarray(rows), deep=True))
