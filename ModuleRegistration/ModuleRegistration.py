@@ -22,8 +22,8 @@ from CranioNavLib.host import (  # noqa: E402
     slicer,
 )
 from CranioNavLib.module_logic import ParametersInScene, describeModule  # noqa: E402
+from CranioNavLib.module_widget import PanelOfModule  # noqa: E402
 from CranioNavLib.panel import Level, Progress, Reading, StepState, StepStatus, Task  # noqa: E402
-from CranioNavLib.panel_model import PanelModel  # noqa: E402
 from ModuleRegistrationLib.panel_description import PANEL, RegistrationParameters  # noqa: E402
 
 LEVELS = {"accepted": Level.GOOD, "warning": Level.WARNING, "refused": Level.BAD, "landmarks": Level.WARNING}
@@ -39,29 +39,14 @@ class ModuleRegistration(ScriptedLoadableModule):
         describeModule(self.parent, "CranioNav Registration", PANEL, ["ModuleTracking", "ModuleUltrasound"])
 
 
-class ModuleRegistrationWidget(ScriptedLoadableModuleWidget):
+class ModuleRegistrationWidget(PanelOfModule, ScriptedLoadableModuleWidget):
     """The panel inside 3D Slicer."""
 
-    def setup(self):
-        """Draw the panel."""
-        super().setup()
-        from CranioNavLib.panel_qt import show_in
+    panelDescription = PANEL
 
-        self.logic = ModuleRegistrationLogic()
-        self.panel = show_in(self, PanelModel(PANEL, self.logic))
-
-    def enter(self):
-        """The user opened the module."""
-        self.panel.start()
-        self.panel.refresh()
-
-    def exit(self):
-        """The user left the module."""
-        self.panel.stop()
-
-    def cleanup(self):
-        """The module is about to be unloaded."""
-        self.panel.close()
+    def createLogic(self):
+        """The module's logic."""
+        return ModuleRegistrationLogic()
 
 
 class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):

@@ -21,8 +21,8 @@ from CranioNavLib.host import (  # noqa: E402
     slicer,
 )
 from CranioNavLib.module_logic import ParametersInScene, describeModule  # noqa: E402
+from CranioNavLib.module_widget import PanelOfDevice  # noqa: E402
 from CranioNavLib.panel import Level, Reading, StepState, StepStatus  # noqa: E402
-from CranioNavLib.panel_model import PanelModel  # noqa: E402
 from ModuleTrackingLib.panel_description import PANEL, PointList, Tool, TrackingParameters  # noqa: E402
 from ModuleTrackingLib.tracker import PoseStatus, TrackerError  # noqa: E402
 
@@ -39,34 +39,15 @@ class ModuleTracking(ScriptedLoadableModule):
         describeModule(self.parent, "CranioNav Tracking", PANEL, [])
 
 
-class ModuleTrackingWidget(ScriptedLoadableModuleWidget):
+class ModuleTrackingWidget(PanelOfDevice, ScriptedLoadableModuleWidget):
     """The panel inside 3D Slicer. Tracking goes on while another module is shown."""
 
-    def setup(self):
-        """Draw the panel."""
-        super().setup()
-        from CranioNavLib.panel_qt import show_in
-        from CranioNavLib.panel_qt_widgets import Ticker
+    panelDescription = PANEL
+    pollMs = POLL_MS
 
-        self.logic = ModuleTrackingLogic()
-        self.panel = show_in(self, PanelModel(PANEL, self.logic))
-        self.ticker = Ticker(self.parent, POLL_MS, self.logic.poll)
-        self.ticker.start()
-
-    def enter(self):
-        """The user opened the module."""
-        self.panel.start()
-        self.panel.refresh()
-
-    def exit(self):
-        """The user left the module."""
-        self.panel.stop()
-
-    def cleanup(self):
-        """The module is about to be unloaded."""
-        self.ticker.stop()
-        self.logic.disconnect()
-        self.panel.close()
+    def createLogic(self):
+        """The module's logic."""
+        return ModuleTrackingLogic()
 
 
 class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):

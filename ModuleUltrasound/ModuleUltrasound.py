@@ -21,8 +21,8 @@ from CranioNavLib.host import (  # noqa: E402
     slicer,
 )
 from CranioNavLib.module_logic import ParametersInScene, describeModule  # noqa: E402
+from CranioNavLib.module_widget import PanelOfDevice  # noqa: E402
 from CranioNavLib.panel import Level, Progress, Reading, StepState, StepStatus, Task  # noqa: E402
-from CranioNavLib.panel_model import PanelModel  # noqa: E402
 from ModuleUltrasoundLib.device import DeviceError  # noqa: E402
 from ModuleUltrasoundLib.panel_description import PANEL, UltrasoundParameters  # noqa: E402
 
@@ -41,34 +41,15 @@ class ModuleUltrasound(ScriptedLoadableModule):
         describeModule(self.parent, "CranioNav Ultrasound", PANEL, ["ModuleTracking"])
 
 
-class ModuleUltrasoundWidget(ScriptedLoadableModuleWidget):
+class ModuleUltrasoundWidget(PanelOfDevice, ScriptedLoadableModuleWidget):
     """The panel inside 3D Slicer. Lines are taken while another module is shown, too."""
 
-    def setup(self):
-        """Draw the panel."""
-        super().setup()
-        from CranioNavLib.panel_qt import show_in
-        from CranioNavLib.panel_qt_widgets import Ticker
+    panelDescription = PANEL
+    pollMs = POLL_MS
 
-        self.logic = ModuleUltrasoundLogic()
-        self.panel = show_in(self, PanelModel(PANEL, self.logic))
-        self.ticker = Ticker(self.parent, POLL_MS, self.logic.poll)
-        self.ticker.start()
-
-    def enter(self):
-        """The user opened the module."""
-        self.panel.start()
-        self.panel.refresh()
-
-    def exit(self):
-        """The user left the module."""
-        self.panel.stop()
-
-    def cleanup(self):
-        """The module is about to be unloaded."""
-        self.ticker.stop()
-        self.logic.disconnect()
-        self.panel.close()
+    def createLogic(self):
+        """The module's logic."""
+        return ModuleUltrasoundLogic()
 
 
 class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
@@ -415,7 +396,9 @@ class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         if self._live is None or not len(self._live):
             return None
         if not self._live.accepted[-1]:
-            return Reading(self._live.reasons[-1], Level.WARNING)
+            from ModuleUltrasoundLib.quality import reason_in_words
+
+            return Reading(reason_in_words(self._live.reasons[-1]), Level.WARNING)
         return Reading(f"{self._live.depths_mm[-1]:.2f}", Level.GOOD)
 
     def quality(self):
