@@ -10,6 +10,7 @@ from trame.widgets import vuetify3 as v3
 
 from Workstation.web.drawings_view import STYLE as DRAWINGS_STYLE
 from Workstation.web.drawings_view import draw_live
+from Workstation.web.keyboard import draw_help
 from Workstation.web.panel_view import PanelView
 from Workstation.web.procedure import HAND, ProcedureStep
 
@@ -37,16 +38,17 @@ class Page:
         with VAppLayout(server) as self.layout:
             self.layout.root.theme = "dark"
             client.Style(STYLE + DRAWINGS_STYLE)
-            self._draw_title()
+            self._draw_title(procedure)
             self._draw_steps(procedure)
             self._draw_open_step(procedure)
             with v3.VMain(style="height: 100vh;"), html.Div(classes="views"):
                 layouts.initialize_layout_grid(self.layout)
 
-    def _draw_title(self) -> None:
+    def _draw_title(self, procedure: tuple[ProcedureStep, ...]) -> None:
         with v3.VAppBar(density="compact", flat=True, border=True):
             v3.VAppBarTitle("CranioNav")
             html.Div("Research software, not a medical device", classes="text-body-2 text-medium-emphasis mr-4")
+            draw_help(procedure, self.panels)
 
     def _draw_steps(self, procedure: tuple[ProcedureStep, ...]) -> None:
         with v3.VNavigationDrawer(permanent=True, width=230), v3.VList(nav=True, density="comfortable"):

@@ -84,7 +84,9 @@ class PanelView:
             self._draw_parameter(item)
 
     def _draw_action(self, item: Action) -> None:
-        with html.Div(classes="my-2", title=(f"{self.key}.blocked['{item.name}'] || '{_quoted(item.help)}'",)):
+        key = f'data-shortcut="{item.shortcut}"' if item.shortcut else ""
+        meant = f"{item.help} ({item.shortcut})" if item.shortcut else item.help
+        with html.Div(classes="my-2", title=(f"{self.key}.blocked['{item.name}'] || '{_quoted(meant)}'",)):
             v3.VBtn(
                 item.label,
                 block=True,
@@ -92,7 +94,7 @@ class PanelView:
                 variant="flat" if item.primary else "tonal",
                 disabled=(f"!!{self.key}.blocked['{item.name}']",),
                 click=f"trigger('{self.key}_run', ['{item.name}'])",
-                raw_attrs=[f'data-action="{item.name}"'],
+                raw_attrs=[f'data-action="{item.name}"', *filter(None, [key])],
             )
             html.Div(
                 f"{{{{ {self.key}.blocked['{item.name}'] }}}}",
