@@ -73,13 +73,12 @@ class WorkstationApp(TrameApp):
 
     def _make_views(self) -> None:
         from trame_slicer.core import LayoutManager, SlicerApp
-        from trame_slicer.rca_view import register_rca_factories
 
-        from Workstation.web.pacing import pace
+        from Workstation.web.pacing import pace, register_quiet_factories
 
         self.slicer = SlicerApp()
         host.adopt_scene(self.slicer.scene, self.slicer.app_logic)
-        register_rca_factories(self.slicer.view_manager, self.server, interactive_quality=PICTURE_QUALITY)
+        register_quiet_factories(self.slicer.view_manager, self.server, PICTURE_QUALITY)
         self.layouts = LayoutManager(self.slicer.scene, self.slicer.view_manager, self.server)
         # the views are made here: made inside the page, their widgets would land between the page's own
         self.layouts.register_layout_dict(LayoutManager.default_grid_configuration())
@@ -120,7 +119,7 @@ class WorkstationApp(TrameApp):
         if turn % 2 == 0 and self.server.state.step == "navigation":
             self._navigate()
         if turn % REFRESH_EVERY == 0:
-            self.views.refresh()
+            self.views.refresh(self._forerun_mm())
             with self.server.state as state:
                 if state.step in ("devices", "ultrasound"):
                     state.live = drawings(self.logics[ULTRASOUND])
@@ -130,6 +129,11 @@ class WorkstationApp(TrameApp):
                 panel.refresh()
         if turn % SAVE_EVERY == 0:
             self._save()
+
+    def _forerun_mm(self) -> float:
+        """Of the probe that is connected, else 0."""
+        stream = self.logics[ULTRASOUND].stream
+        return float(stream.acquisition.forerun_length_mm) if stream is not None else 0.0
 
     def _navigate(self) -> None:
         logic = self.logics[NAVIGATION]

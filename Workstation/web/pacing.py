@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import time
+from functools import partial
 from typing import Any
 
-from trame_slicer.views import ScheduledRenderStrategy
+from trame_slicer.app.ui import create_vertical_slice_view_gutter_ui, create_vertical_view_gutter_ui
+from trame_slicer.rca_view.rca_view_factory import RemoteViewFactory
+from trame_slicer.views import ScheduledRenderStrategy, SliceView, ThreeDView, ViewType
 
 FASTEST_S = 1 / 25  # between two pictures of one view
 SHARE = 0.4  # of the event loop's time, for the rendering of all views together
@@ -72,6 +75,20 @@ class PacedRendering(ScheduledRenderStrategy):
 
     def _end(self, *_: Any) -> None:
         self._budget.note(self.abstract_view, time.monotonic() - self._begun_s)
+
+
+def register_quiet_factories(view_manager: Any, server: Any, quality: int) -> None:
+    """Views for the page that do not render while they are made, as nobody looks at them yet."""
+    for kind, view_type, controls in (
+        (SliceView, ViewType.SLICE_VIEW, create_vertical_slice_view_gutter_ui),
+        (ThreeDView, ViewType.THREE_D_VIEW, create_vertical_view_gutter_ui),
+    ):
+        quiet = partial(kind, scheduled_render_strategy=ScheduledRenderStrategy())
+        view_manager.register_factory(
+            RemoteViewFactory(
+                server, quiet, view_type, populate_view_ui_f=controls, target_fps=30.0, blur_fps=10.0, interactive_quality=quality
+            )
+        )
 
 
 def pace(views: list[Any]) -> RenderBudget:

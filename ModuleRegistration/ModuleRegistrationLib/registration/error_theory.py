@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array, check_points
-from scipy import stats
+from scipy import special
 from scipy.interpolate import RectBivariateSpline
 
 from ModuleRegistrationLib.registration.landmarks import motion_jacobian
@@ -99,7 +99,7 @@ def length_statistics(covariances_mm2: npt.ArrayLike, degrees_of_freedom: Option
     total = np.asarray(variances.sum(axis=-1), dtype=np.float64)
     if degrees_of_freedom is not None:
         active = total**2 / np.maximum(np.sum(variances**2, axis=-1), 1e-300)  # 1 for a line, 3 for a sphere
-        widening = np.sqrt(active * stats.f.ppf(0.95, active, degrees_of_freedom) / stats.chi2.ppf(0.95, active))
+        widening = np.sqrt(active * special.fdtri(active, degrees_of_freedom, 0.95) / special.chdtri(active, 0.05))
         p95 = np.asarray(p95 * widening, dtype=np.float64)
     return PredictedTre(mean, p95, np.sqrt(total))
 
