@@ -116,3 +116,21 @@ def reasons_of(
     ]
     chosen = np.select([case for _, case in cases], list(range(len(cases))), default=len(cases) - 1)
     return tuple(cases[index][0] for index in chosen.tolist())
+
+
+CURES = {  # of the reasons that `reasons_of` gives
+    "pose missing": "start tracking the probe",
+    "pose out of view": "show the probe's markers to the camera",
+    "pose invalid": "hold the probe so that all its markers are seen",
+    "saturated": "turn the gain down",
+    "unstable": "hold the probe still",
+    "no contact": "add gel, press a little",
+    "tilt too large": "turn the probe square to the bone",
+    "no echo": "press a little, add gel, tilt",
+    "doubtful echo": "tilt slowly until it is strongest",
+}
+
+
+def reason_in_words(reason: str) -> str:
+    """Why a line is no point, and what the hand can do about it."""
+    return f"{reason}: {CURES[reason]}" if reason in CURES else reason

@@ -14,6 +14,8 @@ BULLS_EYE_DEG = 15.0  # at the rim
 
 def a_line(logic: Any) -> dict[str, Any] | None:
     """The last RF line as an SVG path with skin, bone and the gate between least and greatest depth; None without one."""
+    from ModuleUltrasoundLib.quality import reason_in_words
+
     live = logic.live()
     if live is None:
         return None
@@ -52,13 +54,13 @@ def a_line(logic: Any) -> dict[str, Any] | None:
         "bone": x(skin_s + 2e-3 * depth / speed) if found else None,
         "gate": gate,
         "accepted": accepted,
-        "text": f"{depth:.2f} mm" if found and accepted else (measured.reasons[-1] or "no echo"),
+        "text": f"{depth:.2f} mm" if found and accepted else reason_in_words(measured.reasons[-1] or "no echo"),
     }
 
 
 def bulls_eye(logic: Any) -> dict[str, Any] | None:
     """Where the probe's back end stands off the bone's normal, in a circle of radius 1; None without a guide."""
-    guide = logic.guide()
+    guide, live = logic.guide(), logic.live()
     if guide is None:
         return None
     right, up = (float(value) / BULLS_EYE_DEG for value in guide.bulls_eye_deg)
@@ -67,8 +69,8 @@ def bulls_eye(logic: Any) -> dict[str, Any] | None:
         "x": round(50 + 45 * right / length, 1),
         "y": round(50 - 45 * up / length, 1),
         "aligned": bool(guide.aligned),
-        "on_target": bool(guide.on_target),
-        "distance": f"{guide.distance_mm:.0f} mm off",
+        "good": bool(guide.on_target and guide.aligned and (live is None or live[2].accepted[-1])),
+        "text": f"{guide.distance_mm:.0f} mm from the point, {guide.angle_deg:.0f}° off the bone's normal",
         "ring": round(45 * 2.0 / BULLS_EYE_DEG, 1),
     }
 

@@ -50,6 +50,6 @@ def draw_live(step: str) -> None:
             html.Div(DOTS, v_if="live.points.length", classes="mb-3")
             with html.Div(v_if="live.eye", classes="d-flex align-center mb-2", style="gap: 12px"):
                 html.Div(BULLS_EYE)
-                html.Div("{{ live.eye.on_target ? '✓ on target' : '! ' + live.eye.distance }}", classes="text-h6")
+                html.Div("{{ (live.eye.good ? '✓ ' : '! ') + live.eye.text }}", classes="text-h6")
         html.Div(A_LINE, v_if="live.line")
-        html.Div("{{ live.line.text }}", v_if="live.line", classes="text-h5")
+        html.Div("{{ (live.line.accepted ? '' : '! ') + live.line.text }}", v_if="live.line", classes="text-h5")
