@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from types import TracebackType
 from typing import Callable, Optional
 
-from CranioNavLib.errors import InputError
+from CranioNavLib.device_stream import READ_S, DeviceStream
 from CranioNavLib.rigid import Array
 
 from ModuleTrackingLib.device_clock import ClockReport, DeviceClock
@@ -19,9 +17,7 @@ from ModuleTrackingLib.reference_base import REFERENCE, RelativePose, in_referen
 from ModuleTrackingLib.tracker import PoseStatus, ToolInfo, ToolPose, Tracker, TrackerError
 
 STALENESS_S = 0.2
-RETRY_S = 0.5  # a tracker that returns is found again well within 2 s
 QUEUE_FRAMES = 1024  # four seconds at 250 Hz: longer than any redraw blocks the main thread
-READ_S = 0.1
 RATE_WINDOW_S = 1.0
 
 
@@ -48,7 +44,7 @@ class _Event:
     error: Optional[BaseException] = None
 
 
-class PoseStream:
+class PoseStream(DeviceStream):
     """A tracker read in a thread of its own; everything else is for the main thread, after `poll`.
 
     Poses that leave the stream carry in `host_time_s` the time at which they were taken, on this computer's
@@ -75,6 +71,7 @@ class PoseStream:
         queue_frames: int = QUEUE_FRAMES,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        super().__init__(tracker, TrackerError, f"tracker-{tracker.name}")
         self.tracker, self.staleness_s, self.largest_gap_s = tracker, staleness_s, largest_gap_s
         self.calibrations = dict(calibrations or {})
         self.tools: list[ToolInfo] = []
@@ -82,38 +79,11 @@ class PoseStream:
         self._device_clock = DeviceClock()
         self._queue_frames = queue_frames
         self._queue: deque[_Event] = deque()
-        self._lock = threading.Lock()
-        self._stopping = threading.Event()
-        self._thread: Optional[threading.Thread] = None
         self._histories: dict[str, PoseHistory] = {}
         self._arrivals: deque[float] = deque()
-        self._connected, self._problem = False, "not started"
         self._frames = self._dropped = self._reconnections = 0
 
     # -- the main thread's side -------------------------------------------------------------------------------------
-
-    def start(self) -> None:
-        """Begin reading; returns at once, `state` tells when the tracker is connected."""
-        if self._thread is None:
-            self._stopping.clear()
-            self._problem = "connecting"
-            self._thread = threading.Thread(target=self._run, name=f"tracker-{self.tracker.name}", daemon=True)
-            self._thread.start()
-
-    def stop(self) -> None:
-        """Stop reading and close the tracker; may be called twice."""
-        self._stopping.set()
-        if self._thread is not None:
-            self._thread.join(timeout=10.0)
-            self._thread = None
-        self._connected, self._problem = False, "stopped"
-
-    def __enter__(self) -> PoseStream:
-        self.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.stop()
 
     def poll(self) -> list[list[ToolPose]]:
         """Take over what came since the last call: the frames in order, each a pose of every tool.
@@ -243,25 +213,15 @@ class PoseStream:
                     self._dropped += 1
             self._queue.append(event)
 
-    def _run(self) -> None:
-        connected_before = False
-        while not self._stopping.is_set():
-            try:
-                with self.tracker:
-                    self.tools = list(self.tracker.tools)
-                    self._reconnections += connected_before
-                    connected_before = True
-                    self._put(_Event())
-                    while not self._stopping.is_set():
-                        poses = self.tracker.read(READ_S)
-                        if poses:
-                            self._put(_Event(poses=tuple(poses)))
-            except TrackerError as error:
-                self._put(_Event(connected=False, problem=str(error)))
-                self._stopping.wait(RETRY_S)
-            except InputError as error:
-                self._put(_Event(connected=False, problem=str(error), error=error))
-                return
-            except Exception as error:  # a defect of the plugin: shown on the main thread, not lost in this one
-                self._put(_Event(connected=False, problem=f"{type(error).__name__}: {error}", error=error))
-                return
+    def _opened(self, again: bool) -> None:
+        self.tools = list(self.tracker.tools)
+        self._reconnections += again
+        self._put(_Event())
+
+    def _read(self) -> None:
+        poses = self.tracker.read(READ_S)
+        if poses:
+            self._put(_Event(poses=tuple(poses)))
+
+    def _lost(self, problem: str, error: Optional[BaseException] = None) -> None:
+        self._put(_Event(connected=False, problem=problem, error=error))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import deque
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Callable, Optional
 
 import numpy as np
+from CranioNavLib.device_stream import READ_S, DeviceStream
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Acquisition, Recording
@@ -19,8 +18,6 @@ from ModuleTrackingLib.tracker import PoseStatus, ToolPose
 from ModuleUltrasoundLib.device import AModeDevice, DeviceError, RfLine
 
 QUEUE_LINES = 2048  # ten seconds at 200 lines a second: longer than any redraw blocks the main thread
-READ_S = 0.1
-RETRY_S = 0.5  # a device that returns is found again well within 2 s
 LONGEST_WAIT_S = 0.3  # a line waits so long for the pose after it: longer than redraws keep the poses from being taken over
 
 
@@ -43,45 +40,19 @@ class PosedLine:
     palpation_point: int
 
 
-class LineStream:
+class LineStream(DeviceStream):
     """An A-mode device read in a thread of its own; `poll`, on the main thread, takes the lines over.
 
     A device that fails is opened again. What it refuses (InputError) ends the stream and is raised by `poll`.
     """
 
     def __init__(self, device: AModeDevice, queue_lines: int = QUEUE_LINES) -> None:
+        super().__init__(device, DeviceError, f"amode-{device.name}")
         self.device, self.acquisition = device, Acquisition(0.0, 0.0)  # the real one is known once connected
         self._queue: deque[RfLine] = deque()
         self._queue_lines = queue_lines
-        self._lock = threading.Lock()
-        self._stopping = threading.Event()
-        self._thread: Optional[threading.Thread] = None
-        self._connected, self._problem = False, "not started"
         self._error: Optional[BaseException] = None
         self._lines = self._dropped = 0
-
-    def start(self) -> None:
-        """Begin reading; returns at once."""
-        if self._thread is None:
-            self._stopping.clear()
-            self._problem = "connecting"
-            self._thread = threading.Thread(target=self._run, name=f"amode-{self.device.name}", daemon=True)
-            self._thread.start()
-
-    def stop(self) -> None:
-        """Stop reading and close the device; may be called twice."""
-        self._stopping.set()
-        if self._thread is not None:
-            self._thread.join(timeout=10.0)
-            self._thread = None
-        self._connected, self._problem = False, "stopped"
-
-    def __enter__(self) -> LineStream:
-        self.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.stop()
 
     def poll(self) -> list[RfLine]:
         """The lines that came since the last call, in order.
@@ -108,22 +79,17 @@ class LineStream:
         with self._lock:
             return LineStreamState(self._connected, self._problem, self._lines, self._dropped)
 
-    def _run(self) -> None:
-        while not self._stopping.is_set():
-            try:
-                with self.device:
-                    self.acquisition = self.device.acquisition
-                    self._say(True, "")
-                    while not self._stopping.is_set():
-                        line = self.device.read(READ_S)
-                        if line is not None:
-                            self._put(line)
-            except DeviceError as error:
-                self._say(False, str(error))
-                self._stopping.wait(RETRY_S)
-            except Exception as error:  # refused settings, or a defect of the plugin: shown on the main thread
-                self._say(False, str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}", error)
-                return
+    def _opened(self, again: bool) -> None:
+        self.acquisition = self.device.acquisition
+        self._say(True, "")
+
+    def _read(self) -> None:
+        line = self.device.read(READ_S)
+        if line is not None:
+            self._put(line)
+
+    def _lost(self, problem: str, error: Optional[BaseException] = None) -> None:
+        self._say(False, problem, error)
 
     def _say(self, connected: bool, problem: str, error: Optional[BaseException] = None) -> None:
         with self._lock:

@@ -73,7 +73,7 @@ def test_lines_arrive_in_order_and_the_device_is_closed():
 
 
 def test_a_device_that_fails_is_opened_again(monkeypatch):
-    monkeypatch.setattr("ModuleUltrasoundLib.line_stream.RETRY_S", 0.01)
+    monkeypatch.setattr("CranioNavLib.device_stream.RETRY_S", 0.01)
     device = Scripted([line(0), DeviceError("the cable fell out; plug it in"), line(1)])
     with LineStream(device) as stream:
         assert [got.sequence_number for got in take(stream, 2)] == [0, 1]
