@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array, transform_points
-from scipy import stats
+from scipy import special
 
 from ModuleRegistrationLib.registration.closest_field import find_feet
 from ModuleRegistrationLib.registration.landmark_checks import check_landmarks
@@ -168,7 +168,7 @@ def find_moved_reference(problem: RegistrationProblem, result: RegistrationResul
         extended = np.column_stack([design, after])
         solution, freedom = _fit(extended, residuals), len(points) - extended.shape[1]
         left = float(np.sum((residuals - extended @ solution) ** 2))
-        chance = float(stats.f.sf((plain - left) / 3 / max(left / freedom, 1e-12), 3, freedom))
+        chance = float(special.fdtrc(3, freedom, max(plain - left, 0.0) / 3 / max(left / freedom, 1e-12)))
         best = min(best, (chance, int(split), float(np.linalg.norm(solution[-3:]))))
     chance, split, shift = best
     enough = MOVED_MM if len(points) <= SWEEP_POINTS else SWEEP_MOVED_MM

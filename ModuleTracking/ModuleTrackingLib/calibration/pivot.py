@@ -12,7 +12,6 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.parameters import Limits, Parameters
 from CranioNavLib.rigid import Array, check_rigid
 from scipy.special import gammainc
-from scipy.stats import poisson
 
 FEWEST_POSES = 20
 SAMPLE = 8  # poses of one random trial: enough tilt among them, and free of slips in 43 % of trials at 10 % slips
@@ -220,7 +219,8 @@ def _without_slips(poses: Array, rng: np.random.Generator, trials: int) -> npt.N
             break
         used = again
     beyond = 1 - gammainc(1.5, SLIP_SDS**2 / 2)  # of normal misses
-    if (~used).sum() <= poisson.isf(1e-3, len(poses) * beyond) and misses.max() <= CERTAIN_SDS * max(scale, 1e-9):
+    by_chance = gammainc(float((~used).sum()), len(poses) * beyond)  # Poisson's P(that many or more)
+    if by_chance > 1e-3 and misses.max() <= CERTAIN_SDS * max(scale, 1e-9):
         used = np.ones(len(poses), dtype=bool)
     return used
 
