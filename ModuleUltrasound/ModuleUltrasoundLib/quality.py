@@ -119,7 +119,7 @@ def reasons_of(
 
 
 CURES = {  # of the reasons that `reasons_of` gives
-    "pose missing": "start tracking the probe",
+    "pose missing": "show the probe to the camera",
     "pose out of view": "show the probe's markers to the camera",
     "pose invalid": "hold the probe so that all its markers are seen",
     "saturated": "turn the gain down",

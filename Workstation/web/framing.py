@@ -11,13 +11,15 @@ MARGIN = 0.92  # share of the 3-D view that the skull takes up
 
 
 class Framing:
-    """One for all views; looks at their sizes now and then. `bounds` gives what the 3-D view shows, or None."""
+    """One for all views; looks at them now and then, and when one is resized. `bounds` gives what 3-D shows, or None."""
 
     def __init__(self, view_manager: Any, bounds: Callable[[], tuple[float, ...] | None]) -> None:
         self._manager, self._bounds = view_manager, bounds
         self._sizes: dict[str, tuple[int, int]] = {}
         self._fitted: dict[str, tuple[float, ...]] = {}  # how each view stood when it was last fitted
         self._touched: dict[str, bool] = {}
+        for view in view_manager.get_views():  # of the interactor: the window's own event comes before it has its new size
+            view.interactor().AddObserver("WindowResizeEvent", lambda *_: self.keep())
 
     def fit(self) -> None:
         """Fit every view, whatever the user did before."""

@@ -48,7 +48,7 @@ def draw_help(procedure: tuple[ProcedureStep, ...], panels: dict[str, PanelView]
     """The button "?" of the title bar with its list, and the listener of the keys."""
     client.Script(LISTEN)
     v3.VBtn("?", icon=True, size="small", click="keys = !keys", title="Keys (?)", raw_attrs=["data-keys"])
-    with v3.VDialog(v_model=("keys", False), max_width=560), v3.VCard(title="Keys of the open step"), v3.VCardText():
+    with v3.VDialog(v_model=("keys", False), max_width=560), v3.VCard(title="Keys"), v3.VCardText():
         for key, what, step in (*shortcuts(procedure, panels), ("?", "Show or hide this list", "every step")):
             with html.Div(classes="d-flex py-1", style="gap: 16px"):
                 html.Div(key, style="width: 80px", classes="font-weight-bold")
