@@ -72,22 +72,39 @@ def write_table(
 
 
 def print_result(records: Sequence[Mapping[str, Any]], folder: Path) -> None:
-    """One line a case, and where the files are."""
-    from Workstation.terminal import number, print_table
+    """One case as a list that fits 80 columns, several as one line each; then messages and where the files are."""
+    from Workstation.terminal import print_table
 
-    columns = ["case", "mode", "method", "status", "TRE mean", "TRE max", "predicted", "95%", "points", "c (m/s)", "time (s)"]
-    rows = []
-    for record in records:
-        predicted, p95 = record.get("predicted_tre_mm") or [], record.get("predicted_tre_p95_mm") or []
-        rows.append([
-            str(record["case"]), record["mode"] or "–", record["method"] or "–", str(record["status"]),
-            number(record["tre_mean_mm"]), number(record["tre_max_mm"]),
-            number(sum(predicted) / len(predicted) if predicted else None), number(max(p95, default=None)),
-            f"{record['points_used']}" if record["points_used"] is not None else "–",
-            number(record["speed_of_sound_m_s"], 0), number(record["duration_s"], 1),
-        ])  # fmt: skip
-    print_table("Registration (TRE and its prediction in mm; 95%: at the worst target)", columns, rows)
+    quantities = [_quantities(record) for record in records]
+    title = "Registration (TRE in mm; 95%: at the worst target)"
+    if len(records) == 1:
+        print_table(title, ["quantity", "value"], [[name, value] for name, value in quantities[0].items()])
+    else:
+        print_table(title, list(quantities[0]), [list(row.values()) for row in quantities])
     for record in records:
         for message in record["messages"]:
             print(f"{record['case']}: {message}")
     print(f"files: {folder}")
+
+
+def _quantities(record: Mapping[str, Any]) -> dict[str, str]:
+    """What people look at first, by name."""
+    from statistics import stdev
+
+    from Workstation.terminal import number
+
+    errors, predicted = record["tre_mm"], record["predicted_tre_mm"]
+    return {
+        "case": str(record["case"]),
+        "mode": record["mode"] or "–",
+        "method": record["method"] or "–",
+        "status": str(record["status"]),
+        "TRE mean": number(record["tre_mean_mm"]),
+        "SD": number(stdev(errors) if len(errors) > 1 else None),
+        "max": number(record["tre_max_mm"]),
+        "predicted": number(sum(predicted) / len(predicted) if predicted else None),
+        "95%": number(max(record["predicted_tre_p95_mm"], default=None)),
+        "points": "–" if record["points_used"] is None else str(record["points_used"]),
+        "c (m/s)": number(record["speed_of_sound_m_s"], 0),
+        "time (s)": number(record["duration_s"], 1),
+    }

@@ -29,7 +29,7 @@ def demo(
 
     from Workstation.demo_case import choose_head, make_case
     from Workstation.outputs import print_result, write_outputs
-    from Workstation.terminal import number, print_json, progress_bar
+    from Workstation.terminal import print_json, progress_bar
 
     started = time.monotonic()
     folder = output_folder(output)
@@ -44,9 +44,6 @@ def demo(
         print_json(record)
     else:
         print_result([record], folder)
-        if result.tre:
-            spread = f"{number(result.tre.mean_mm)} ± {number(result.tre.sd_mm)} mm (max {number(result.tre.max_mm)})"
-            print(f"TRE {spread} at {len(result.tre.errors_mm)} simulated markers")
         print(f"head: {head}; tracker, probe and patient simulated, seed {seed}; {time.monotonic() - started:.0f} s in all")
         print(f"report: {folder / 'report.html'}")
     if result.verdict.status == "refused":
