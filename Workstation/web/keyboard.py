@@ -9,8 +9,12 @@ from trame.widgets import vuetify3 as v3
 from Workstation.web.panel_view import PanelView
 from Workstation.web.procedure import HAND, ProcedureStep
 
-# Text fields keep their keys; a button or slider reached by Tab keeps those that work it.
+# Text fields keep their keys; a button or slider reached by Tab keeps those that work it, one that was clicked does not.
 LISTEN = """
+window.addEventListener('click', (event) => {
+  const button = event.detail && event.target.closest && event.target.closest('button, a');
+  if (button) button.blur();
+}, true);
 window.addEventListener('keydown', (event) => {
   const at = event.target;
   if (event.altKey || event.metaKey || event.repeat) return;
