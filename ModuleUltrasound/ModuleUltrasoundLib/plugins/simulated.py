@@ -18,7 +18,7 @@ from ModuleUltrasoundLib.device import AMODE_DEVICES, AModeDevice, DeviceError, 
 @dataclass(frozen=True)
 class SimulatedAModeSettings(Parameters):
     rate_hz: Annotated[float, Limits(1, 1000), "lines a second"] = 40.0
-    lost_share: Annotated[float, Limits(0, 1), "share of lines that never arrive"] = 0.0
+    lost_share: Annotated[float, Limits(0, 0.99), "share of lines that never arrive"] = 0.0
     fail_after_s: Annotated[Optional[float], Limits(0, 1e6), "the link breaks after this time; not given: never"] = None
     head: Annotated[Head, "head on the table if no session runs yet"] = Head.SAMPLE
     seed: Annotated[int, Limits(0, 2**31), "of the session, if none runs yet, and of lost lines"] = 0
