@@ -143,3 +143,10 @@ def test_a_point_added_to_a_list_is_saved(an_empty_scene, tmp_path):
     scene.release("LandmarksPatient")
     session.save("landmarks")
     assert not (tmp_path / "landmarks-patient.mrk.json").exists()
+
+
+def test_a_button_with_a_shortcut_names_its_key_in_the_browser(an_empty_scene):
+    _, page = drawn_in_the_web("ModuleTracking")
+    assert 'data-shortcut="Space"' in page
+    assert 'data-shortcut="Ctrl+Z"' in page
+    assert "(Space)" in page
