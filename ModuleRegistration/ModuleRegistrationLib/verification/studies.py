@@ -26,7 +26,8 @@ from CranioNavLib.rigid import Array
 from CranioNavLib.volume import Volume
 
 from ModuleRegistrationLib.anatomy.segmentation import BoneSurfaces, segment_bone
-from ModuleRegistrationLib.registration.error_theory import predict_tre, predict_tre_of
+from ModuleRegistrationLib.procedure import LANDMARK_MODES, LANDMARKS_ALONE, STYLUS_POINT_SD_MM, USUAL_FLE_MM
+from ModuleRegistrationLib.registration.error_theory import predict_tre_of
 from ModuleRegistrationLib.registration.landmarks import LandmarkRegistration, register_landmarks
 from ModuleRegistrationLib.registration.problem import METHODS, RegistrationProblem, RegistrationResult
 from ModuleRegistrationLib.registration.verdict import judge
@@ -36,7 +37,6 @@ from ModuleRegistrationLib.verification.tre import target_errors
 
 STUDIES = ("phantom", "cadaver", "patient")
 LARGE_TRE_MM = 3.0  # a registration this far off would be noticed or do harm; the share above it is always told
-STYLUS_SD_MM = 0.5  # per axis, of a point touched on bone: tracker, tip calibration and touch
 Progress = Callable[[int, int], None]  # trials done, trials in all
 
 
@@ -168,18 +168,15 @@ def run_seed(study: str, volume: Optional[Volume], seed: int, modes: Sequence[st
 def _trial(study: str, mode: str, method: str, seed: int, patient: VirtualPatient, plan: _Plan, data: SessionData) -> TrialRow:
     started = time.monotonic()
     targets = patient.markers_ras_mm
-    landmarks = register_landmarks(data.fiducials_patient_mm, data.fiducials_ct_mm, labels=data.fiducial_labels)
-    status, message, used, speed = "accepted", "", len(data.fiducials_ct_mm), math.nan
-    if mode in ("IIb", "III"):
-        problem = _problem(plan.bone, landmarks, data)
-        result = METHODS.create(method).register(problem)
-        verdict = judge(problem, result, targets)
-        status, message = str(getattr(verdict.status, "value", verdict.status)), " ".join(verdict.messages)
-        matrix, used, speed = result.reference_to_ras, int(result.used.sum()), result.speed_of_sound_m_s
-        predicted = _predicted(result, targets)
-    else:
-        matrix = landmarks.reference_to_ras
-        predicted = float(predict_tre(landmarks.covariance, landmarks.pivot_ras_mm, targets).mean_mm.mean())
+    alone = mode in LANDMARK_MODES
+    fle_mm = USUAL_FLE_MM[mode]
+    landmarks = register_landmarks(
+        data.fiducials_patient_mm, data.fiducials_ct_mm, labels=data.fiducial_labels, expected_fle_mm=fle_mm
+    )
+    problem = _problem(plan.bone, landmarks, data, landmark_sd_mm=fle_mm / math.sqrt(3) if alone else None)
+    result = METHODS.create(method).register(problem)
+    verdict = judge(problem, result, targets, LANDMARKS_ALONE if alone else None)
+    matrix = result.reference_to_ras
     taken_s = time.monotonic() - started
     tre = target_errors(matrix, targets, data.targets_patient_mm)
     before = target_errors(landmarks.reference_to_ras, targets, data.targets_patient_mm)
@@ -189,32 +186,35 @@ def _trial(study: str, mode: str, method: str, seed: int, patient: VirtualPatien
         mode=mode,
         method=method,
         seed=seed,
-        status=status,
+        status=verdict.status,
         tre_mean_mm=tre.mean_mm,
         tre_max_mm=tre.max_mm,
         landmark_tre_mean_mm=before.mean_mm,
-        predicted_tre_mm=predicted,
+        predicted_tre_mm=_predicted(result, targets),
         plausibility_mean_mm=near.mean_mm,
-        points_used=used,
-        speed_of_sound_m_s=speed,
+        points_used=len(data.fiducials_ct_mm) if alone else int(result.used.sum()),
+        speed_of_sound_m_s=result.speed_of_sound_m_s,
         duration_s=taken_s,
-        message=message,
+        message="; ".join(verdict.messages),
     )
 
 
-def _problem(bone: BoneSurfaces, landmarks: LandmarkRegistration, data: SessionData) -> RegistrationProblem:
+def _problem(
+    bone: BoneSurfaces, landmarks: LandmarkRegistration, data: SessionData, landmark_sd_mm: Optional[float]
+) -> RegistrationProblem:
     if data.recording is not None:
         from ModuleUltrasoundLib.measure import bone_points, measure_lines
 
         points = bone_points(data.recording, measure_lines(data.recording))
     else:
-        points = BonePoints.palpated(data.points_patient_mm, STYLUS_SD_MM, data.point_labels)
+        points = BonePoints.palpated(data.points_patient_mm, STYLUS_POINT_SD_MM, data.point_labels)
     return RegistrationProblem(
         surface=bone.outer_table,
         points=points,
         initial_reference_to_ras=landmarks.reference_to_ras,
         landmarks_ct_mm=data.fiducials_ct_mm,
         landmarks_patient_mm=data.fiducials_patient_mm,
+        landmark_sd_mm=landmark_sd_mm,
         surface_sd_mm=bone.position_sd_mm,
         surface_offset_sd_mm=bone.offset_sd_mm,
     )
