@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from CranioNavLib.errors import InputError
-from CranioNavLib.recording import Acquisition, Recording, journal_of
+from CranioNavLib.recording import Acquisition, Recording, pixels_beside
 from CranioNavLib.rigid import LARGEST_COORDINATE_MM, ORTHONORMAL_TOLERANCE, Array
 
 FRAME_FIELD = re.compile(r"seq_frame(\d+)_(\w+)", re.IGNORECASE)
@@ -90,6 +90,9 @@ def read_recording(path: str | Path, allow_truncated: bool = False, require_prob
     header = _read_header(Path(path))
     samples, count = _check_layout(header)
     lines, whole = _read_pixels(header, samples, count)
+    # Under way, or its process was killed: what is complete is good (see RecordingWriter).
+    unfinished = header.get("ElementDataFile") == pixels_beside(header.path).name
+    allow_truncated = allow_truncated or unfinished
     if whole != count:
         if not allow_truncated:
             raise header.refuse(
@@ -98,7 +101,8 @@ def read_recording(path: str | Path, allow_truncated: bool = False, require_prob
             )
         count = min(whole, count)
     beyond = max((max(values, default=-1) for values in header.frames.values()), default=-1) + 1
-    if beyond > count and not allow_truncated:
+    ahead = 0 if samples else 1  # of poses only: a killed process leaves one frame that is not counted yet
+    if beyond > count + ahead and not allow_truncated:
         raise header.refuse(f"fields for {beyond} frames but DimSize announces {count}; mend DimSize or record again")
     if count == 0:
         raise header.refuse("holds no whole frame; record again")
@@ -123,8 +127,6 @@ def read_recording(path: str | Path, allow_truncated: bool = False, require_prob
 
 def _read_header(path: Path) -> _Header:
     if not path.is_file():
-        if path.suffix == ".mha" and journal_of(path).is_file():
-            raise InputError(f"{path}: the recording was interrupted; recover it with `cranionav tracker recover {path.name}`")
         raise InputError(f"{path}: no such file; give the path of a recording (.igs.mha)")
     header = _Header(path, {}, {}, {}, {}, 0)
     with path.open("rb") as file:

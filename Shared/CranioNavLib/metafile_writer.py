@@ -1,8 +1,9 @@
 """Writing sequence metafiles: whole at once, or frame by frame so that a killed process loses next to nothing.
 
-A metafile's frame fields stand before its pixels, so a growing recording cannot be one file. RecordingWriter keeps a
-journal of two: `NAME.part.igs.mhd` (fields) and `NAME.part.raw` (pixels). After every frame the pair is a valid
-metafile that SimpleITK and 3D Slicer read; `close` (or `recover`, after a kill) joins it into `NAME.igs.mha`.
+A metafile's frame fields stand before its pixels, so a growing recording of lines cannot be one file. RecordingWriter
+keeps the fields in `NAME.igs.mha` and the pixels in `NAME.part.raw`, which the former names. After every frame the pair
+is a valid metafile that SimpleITK and 3D Slicer read; `close` (or `recover`, after a kill) joins it into one file. A
+recording of poses only has no pixels, and is one file all along.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy.typing as npt
 from CranioNavLib.errors import InputError
 from CranioNavLib.files import written_whole
 from CranioNavLib.metafile_reader import is_transform
-from CranioNavLib.recording import Acquisition, Recording, journal_of
+from CranioNavLib.recording import Acquisition, Recording, pixels_beside
 from CranioNavLib.rigid import Array
 
 PAD = 40  # PLUS pads DimSize to this width, so that it can be patched in place
@@ -62,7 +63,7 @@ class RecordingWriter:
     Parameters
     ----------
     path : path
-        The .igs.mha file to be; the journal stands beside it until `close`.
+        The .igs.mha file, begun with the first frame; pixels stand in a file beside it until `close`.
     samples : int
         Samples a line; 0 for poses only.
     acquisition : Acquisition
@@ -82,20 +83,20 @@ class RecordingWriter:
             raise InputError("a recording of A-lines needs their acquisition (sampling and transducer frequency)")
         self.path, self.samples, self.count = _checked_target(path), samples, 0
         self._last_time = -np.inf
-        self.journal = journal_of(self.path)
-        self._raw_path = _pixels_of(self.journal)
-        if self.journal.exists():
-            raise InputError(f"{self.journal} holds an interrupted recording; recover or remove it, or record to another name")
-        header = _global_header(samples, 0, acquisition, fields or {})
-        self._size_at = header.index(b"DimSize = ")
-        self._end = len(header)
-        self._tail = f"ElementDataFile = {self._raw_path.name}\n".encode("ascii")
+        self._raw_path = pixels_beside(self.path)
+        if self._raw_path.exists() and self._raw_path.stat().st_size and not _is_whole(self.path):
+            raise InputError(f"{self.path} holds an interrupted recording; recover or remove it, or record to another name")
+        self._header = _global_header(samples, 0, acquisition, fields or {})
+        self._tail = f"ElementDataFile = {self._raw_path.name if samples else 'LOCAL'}\n".encode("ascii")
+        self._fields: Optional[int] = None
+        self._raw: Optional[int] = None
         try:
-            self._raw: Optional[int] = os.open(self._raw_path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
-            self._fields: Optional[int] = os.open(self.journal, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+            # An older recording of that name is safe until the first frame of the new one.
+            self._fields = os.open(self.path, os.O_WRONLY | os.O_CREAT, 0o666)
+            if samples:
+                self._raw = os.open(self._raw_path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
         except OSError as error:
             raise InputError(f"cannot write {self.path}: {error.strerror}; choose a folder that exists and is writable") from None
-        _write_at(self._fields, header + self._tail, 0)
 
     def append(
         self,
@@ -120,7 +121,7 @@ class RecordingWriter:
         palpation_point : int
             Point of the protocol, -1 for none.
         """
-        if self._fields is None or self._raw is None:
+        if self._fields is None:
             raise InputError(f"{self.path}: the recording is closed; start a new one")
         if not np.isfinite(timestamp_s) or timestamp_s < self._last_time:
             raise InputError(f"{self.path}: frame {self.count} is at {timestamp_s} s, the one before at {self._last_time} s")
@@ -128,12 +129,19 @@ class RecordingWriter:
         if size != self.samples:
             raise InputError(f"{self.path}: frame {self.count} has {size} samples, expected {self.samples}")
         fields = _frame_fields(self.count, timestamp_s, transforms, statuses or {}, palpation_point)
-        # Order matters: pixels, then fields, then the count. A kill in between leaves a file that is still right.
         try:
-            if line is not None:
+            if self.count == 0:
+                os.ftruncate(self._fields, 0)
+                _write_at(self._fields, self._header + self._tail, 0)
+                self._end = len(self._header)
+            # Order matters: pixels, then fields, then the count; of the fields first what comes behind the old last line,
+            # then what takes its place. A kill in between leaves files that are still right.
+            if line is not None and self._raw is not None:
                 _write_at(self._raw, np.ascontiguousarray(line, dtype="<i2").tobytes(), self.count * 2 * self.samples)
-            _write_at(self._fields, fields + self._tail, self._end)
-            _write_at(self._fields, _dim_size(self.samples, self.count + 1), self._size_at)
+            added, cut = fields + self._tail, len(self._tail)
+            _write_at(self._fields, added[cut:], self._end + cut)
+            _write_at(self._fields, added[:cut], self._end)
+            _write_at(self._fields, _dim_size(self.samples, self.count + 1), self._header.index(b"DimSize = "))
         except OSError as error:
             raise InputError(
                 f"cannot go on writing {self.path}: {error.strerror}; {self.count} frames are safe, free space and record anew"
@@ -143,17 +151,21 @@ class RecordingWriter:
         self._last_time = timestamp_s
 
     def close(self) -> None:
-        """Join the journal into the file; may be called twice. A recording without frames leaves no file."""
-        if self._fields is None or self._raw is None:
+        """Join fields and pixels into one file; may be called twice. A recording without frames leaves no file."""
+        if self._fields is None:
             return
-        os.close(self._fields)
-        os.close(self._raw)
+        empty = self.count == 0 and os.fstat(self._fields).st_size == 0
+        for handle in (self._fields, self._raw):
+            if handle is not None:
+                os.close(handle)
+        joined = self._raw is None
         self._fields = self._raw = None
-        if self.count:
+        if empty:
+            self.path.unlink()
+        if self.count == 0:
+            self._raw_path.unlink(missing_ok=True)
+        elif not joined:
             recover(self.path)
-        else:
-            self.journal.unlink()
-            self._raw_path.unlink()
 
     def __enter__(self) -> RecordingWriter:
         return self
@@ -163,33 +175,45 @@ class RecordingWriter:
 
 
 def recover(path: str | Path) -> int:
-    """Finish an interrupted recording: join its journal into `path`. Returns the number of frames.
+    """Finish an interrupted recording: join the pixels beside `path` into it. Returns the number of frames.
 
     Raises
     ------
     InputError
-        There is no journal beside `path`, it holds no whole frame, or the disk cannot take the file.
+        There is no interrupted recording, it holds no whole frame, or the disk cannot take the file.
     """
     target = _checked_target(path)
-    journal = journal_of(target)
-    raw = _pixels_of(journal)
-    if not journal.is_file() or not raw.is_file():
-        raise InputError(f"{target}: no interrupted recording ({journal.name}, {raw.name}) beside it; nothing to recover")
-    count, samples = _whole_frames(journal, raw)
+    raw = pixels_beside(target)
+    if not target.is_file():
+        raise InputError(f"{target}: no such file; nothing to recover")
+    if not raw.is_file() and _is_whole(target):
+        return _whole_frames(target, None)[0]  # it was not interrupted, or held poses only
+    if not raw.is_file():
+        raise InputError(f"{target}: its pixel file {raw.name} is missing; nothing to recover")
+    count, samples = _whole_frames(target, raw)
     if count == 0:
-        raise InputError(f"{journal}: holds no whole frame; remove it and record again")
+        raise InputError(f"{target}: holds no whole frame; remove it and record again")
     try:
         with written_whole(target) as temporary, temporary.open("wb") as file:
-            for line in _lines_of_frames(journal, count):
+            for line in _lines_of_frames(target, count):
                 file.write(_dim_size(samples, count) if line.startswith(b"DimSize") else line)
             file.write(b"ElementDataFile = LOCAL\n")
             with raw.open("rb") as pixels:
                 _copy(pixels, file, count * samples * 2)
     except OSError as error:
-        raise InputError(f"cannot write {target}: {error.strerror}; the journal {journal} still holds the recording") from None
-    journal.unlink()
+        raise InputError(f"cannot write {target}: {error.strerror}; it still holds the recording, with {raw.name}") from None
     raw.unlink()
     return count
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a file's pixels are its own."""
+    if path.is_file():
+        with path.open("rb") as file:
+            for line in file:
+                if line.startswith(b"ElementDataFile"):
+                    return line.split()[-1:] == [b"LOCAL"]
+    return False
 
 
 def _checked_target(path: str | Path) -> Path:
@@ -197,10 +221,6 @@ def _checked_target(path: str | Path) -> Path:
     if not target.name.lower().endswith(".mha"):
         raise InputError(f"{target}: recordings are written as .igs.mha; give a name with that ending")
     return target
-
-
-def _pixels_of(journal: Path) -> Path:
-    return journal.with_name(journal.name[: -len(".igs.mhd")] + ".raw")
 
 
 def _write_at(handle: int, data: bytes, offset: int) -> None:
@@ -218,25 +238,27 @@ def _copy(source: BinaryIO, target: BinaryIO, size: int) -> None:
     while size:
         data = source.read(min(size, 1 << 20))
         if not data:
-            raise OSError(5, "the journal's pixel file became shorter")
+            raise OSError(5, "the pixel file became shorter")
         target.write(data)
         size -= len(data)
 
 
-def _whole_frames(journal: Path, raw: Path) -> tuple[int, int]:
+def _whole_frames(path: Path, raw: Optional[Path]) -> tuple[int, int]:
     """Frames whose fields and pixels are both complete, and samples a line."""
     count = samples = 0
-    with journal.open("rb") as file:
+    with path.open("rb") as file:
         for line in file:
+            if line.startswith(b"ElementDataFile"):
+                break
             if line.startswith(b"DimSize"):
                 samples = int(line.split()[2])
             count += FRAME_DONE.fullmatch(line) is not None
-    return (min(count, raw.stat().st_size // (2 * samples)) if samples else count), samples
+    return (min(count, raw.stat().st_size // (2 * samples)) if raw is not None and samples else count), samples
 
 
-def _lines_of_frames(journal: Path, count: int) -> Iterator[bytes]:
+def _lines_of_frames(path: Path, count: int) -> Iterator[bytes]:
     """The header up to and with the fields of frame count - 1."""
-    with journal.open("rb") as file:
+    with path.open("rb") as file:
         for line in file:
             yield line
             done = FRAME_DONE.fullmatch(line)

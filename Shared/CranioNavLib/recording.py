@@ -40,8 +40,8 @@ class Recording:
         return len(self.lines)
 
 
-def journal_of(path: str | Path) -> Path:
-    """The field file of the journal that RecordingWriter keeps for the recording `path`."""
+def pixels_beside(path: str | Path) -> Path:
+    """Where RecordingWriter keeps the pixels of the recording `path` until it is closed."""
     path = Path(path)
     stem = re.sub(r"(\.igs|\.seq)?\.mha$", "", path.name)
-    return path.with_name(f"{stem}.part.igs.mhd")
+    return path.with_name(f"{stem}.part.raw")

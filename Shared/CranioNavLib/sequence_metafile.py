@@ -7,6 +7,6 @@ from __future__ import annotations
 
 from CranioNavLib.metafile_reader import read_recording
 from CranioNavLib.metafile_writer import RecordingWriter, recover, write_recording
-from CranioNavLib.recording import Acquisition, Recording, journal_of
+from CranioNavLib.recording import Acquisition, Recording, pixels_beside
 
-__all__ = ["Acquisition", "Recording", "RecordingWriter", "journal_of", "read_recording", "recover", "write_recording"]
+__all__ = ["Acquisition", "Recording", "RecordingWriter", "pixels_beside", "read_recording", "recover", "write_recording"]

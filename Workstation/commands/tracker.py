@@ -114,7 +114,7 @@ def recover_recording(
     recording: Annotated[Path, typer.Argument(metavar="FILE.igs.mha", help="the recording that was interrupted")],
     json: Json = False,
 ) -> None:
-    """Finish a recording whose process was killed or whose computer lost power."""
+    """Join a recording whose process was killed or whose computer lost power into one file."""
     from CranioNavLib.sequence_metafile import recover
 
     from Workstation.terminal import print_json

@@ -18,7 +18,7 @@ from CranioNavLib.sequence_metafile import (
     Acquisition,
     Recording,
     RecordingWriter,
-    journal_of,
+    pixels_beside,
     read_recording,
     recover,
     write_recording,
@@ -155,12 +155,51 @@ def test_a_growing_recording_is_readable_at_every_moment(tmp_path):
         writer.append(
             float(recording.timestamps_s[k]), {"ProbeToReference": recording.probe_to_reference[k]}, line=recording.lines[k]
         )
-        image = SimpleITK.ReadImage(str(writer.journal))
+        image = SimpleITK.ReadImage(str(writer.path))
         np.testing.assert_array_equal(SimpleITK.GetArrayFromImage(image)[:, 0], recording.lines[: k + 1])
-        if recording.statuses[0] == "OK":
-            assert len(read_recording(writer.journal)) == k + 1
+        np.testing.assert_array_equal(read_recording(writer.path).lines, recording.lines[: k + 1])
+    if os.name == "posix":
+        poses = sum(status == "OK" for status in recording.statuses)
+        assert slicer_items(writer.path) == poses
     writer.close()
     writer.close()
+
+
+def test_a_recording_of_poses_is_one_whole_file_at_every_moment(tmp_path):
+    writer = RecordingWriter(tmp_path / "p.igs.mha")
+    for k in range(5):
+        writer.append(k / 10, {"ProbeToReference": rigid(np.eye(3), (k, 0, 0))})
+        assert SimpleITK.ReadImage(str(writer.path)).GetSize()[2] == k + 1
+        assert read_recording(writer.path).probe_to_reference[-1, 0, 3] == k
+        assert [path.name for path in tmp_path.iterdir()] == ["p.igs.mha"]
+    grown = writer.path.read_bytes()
+    writer.close()
+    assert writer.path.read_bytes() == grown
+
+
+@pytest.mark.skipif(not hasattr(os, "pwrite"), reason="kills at a stand-in for pwrite")
+@pytest.mark.parametrize("samples", [0, 4])
+@pytest.mark.parametrize("survived", [0, 1, 2, 3])
+def test_a_kill_between_any_two_writes_leaves_the_frames_before(tmp_path, monkeypatch, samples, survived):
+    line = np.arange(4, dtype=np.int16) if samples else None
+    writer = RecordingWriter(tmp_path / "k.igs.mha", samples, ACQUISITION if samples else None)
+    for k in range(3):
+        writer.append(k / 10, {"ProbeToReference": np.eye(4)}, line=line)
+    real, done = os.pwrite, []
+
+    def dying(handle: int, data: bytes, offset: int) -> int:
+        if len(done) == survived:
+            raise KeyboardInterrupt
+        done.append(offset)
+        return real(handle, data, offset)
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(os, "pwrite", dying)
+        for k in range(3, 9):
+            writer.append(k / 10, {"ProbeToReference": np.eye(4)}, line=line)
+    assert len(read_recording(writer.path)) == SimpleITK.ReadImage(str(writer.path)).GetSize()[2] >= 3
+    assert recover(writer.path) >= 3
+    assert read_recording(writer.path).timestamps_s[2] == 0.2
 
 
 def test_a_killed_process_loses_at_most_100_ms(tmp_path):
@@ -178,34 +217,32 @@ def test_a_killed_process_loses_at_most_100_ms(tmp_path):
     )
     target = tmp_path / "k.igs.mha"
     process = subprocess.Popen([sys.executable, "-c", code, str(target)], stdout=subprocess.PIPE, text=True)
-    journal, deadline = journal_of(target), time.monotonic() + 60
-    while not journal.exists() or journal.read_bytes().count(b"_Timestamp") < 40:
+    deadline = time.monotonic() + 60
+    while not target.exists() or target.read_bytes().count(b"_Timestamp") < 40:
         assert time.monotonic() < deadline
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL if os.name == "posix" else signal.SIGTERM)
     told = [int(line) for line in process.communicate()[0].split()]
     assert len(told) > 30
-    with pytest.raises(InputError, match="interrupted; recover it"):
-        read_recording(target)
-    assert SimpleITK.ReadImage(str(journal_of(target))).GetSize()[2] >= told[-1] - 1
-    count = recover(target)
-    assert count >= told[-1]  # a frame is 17 ms; all that was acknowledged is there
-    recording = read_recording(target)
-    assert len(recording) == count
-    for k in range(count):
-        assert recording.lines[k, 0] == k % 100
-        assert recording.timestamps_s[k] == k / 60
-    assert SimpleITK.GetArrayFromImage(SimpleITK.ReadImage(str(target))).shape == (count, 1, 3200)
-    assert not journal_of(target).exists()
+    for finished in (False, True):  # as it was left, and joined into one file
+        count = recover(target) if finished else SimpleITK.ReadImage(str(target)).GetSize()[2]
+        assert count >= told[-1]  # a frame is 17 ms; all that was acknowledged is there
+        recording = read_recording(target)
+        assert len(recording) == count
+        for k in range(count):
+            assert recording.lines[k, 0] == k % 100
+            assert recording.timestamps_s[k] == k / 60
+        assert SimpleITK.GetArrayFromImage(SimpleITK.ReadImage(str(target))).shape == (count, 1, 3200)
+        assert pixels_beside(target).exists() != finished
 
 
 @pytest.mark.parametrize("cut", range(0, 400, 23))
-def test_a_journal_cut_anywhere_keeps_its_whole_frames(tmp_path, cut):
+def test_an_unfinished_recording_cut_anywhere_keeps_its_whole_frames(tmp_path, cut):
     recording = a_recording(6)
     writer = RecordingWriter(tmp_path / "c.igs.mha", 64, ACQUISITION)
     feed(writer, recording)
-    journal, raw = writer.journal, writer.journal.with_name("c.part.raw")
-    journal.write_bytes(journal.read_bytes()[: journal.stat().st_size - 4 * cut])
+    fields, raw = writer.path, writer.path.with_name("c.part.raw")
+    fields.write_bytes(fields.read_bytes()[: fields.stat().st_size - 4 * cut])
     raw.write_bytes(raw.read_bytes()[: max(raw.stat().st_size - 2 * cut, 0)])
     if cut > 320:  # less than one line of 64 samples is left
         with pytest.raises(InputError, match="no whole frame"):
@@ -219,10 +256,21 @@ def test_a_journal_cut_anywhere_keeps_its_whole_frames(tmp_path, cut):
 
 
 def test_an_interrupted_recording_is_not_overwritten(tmp_path):
-    writer = RecordingWriter(tmp_path / "a.igs.mha")
-    writer.append(0.0, {"ProbeToReference": np.eye(4)})
+    writer = RecordingWriter(tmp_path / "a.igs.mha", 4, ACQUISITION)
+    writer.append(0.0, {"ProbeToReference": np.eye(4)}, line=np.zeros(4, dtype=np.int16))
     with pytest.raises(InputError, match="interrupted recording; recover or remove it"):
         RecordingWriter(tmp_path / "a.igs.mha")
+
+
+def test_an_older_recording_is_safe_until_the_first_frame_of_the_new_one(tmp_path):
+    recording, path = a_recording(), tmp_path / "a.igs.mha"
+    write_recording(path, recording)
+    RecordingWriter(path, 64, ACQUISITION).close()
+    assert_same(read_recording(path), recording)
+    assert [found.name for found in tmp_path.iterdir()] == ["a.igs.mha"]
+    with RecordingWriter(path, 64, ACQUISITION) as writer:
+        writer.append(0.0, {"ProbeToReference": np.eye(4)}, line=recording.lines[0])
+    assert len(read_recording(path)) == 1
 
 
 @pytest.mark.skipif(not hasattr(os, "pwrite"), reason="fills the disk by a stand-in for pwrite")
