@@ -57,8 +57,7 @@ class Surface:
     @cached_property
     def triangle_normals(self) -> Array:
         """(T, 3) unit outward normals."""
-        a, b, c = (self.vertices_mm[self.triangles[:, k]] for k in range(3))
-        normals = np.cross(b - a, c - a)
+        normals = self._double_areas()
         lengths: Array = np.linalg.norm(normals, axis=1, keepdims=True)
         unit: Array = normals / np.maximum(lengths, 1e-30)
         return unit
@@ -66,20 +65,31 @@ class Surface:
     @cached_property
     def triangle_areas_mm2(self) -> Array:
         """(T,) areas."""
-        a, b, c = (self.vertices_mm[self.triangles[:, k]] for k in range(3))
-        areas: Array = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        areas: Array = 0.5 * np.linalg.norm(self._double_areas(), axis=1)
         return areas
 
     @cached_property
     def vertex_normals(self) -> Array:
         """(V, 3) unit outward normals, area-weighted over the triangles around each vertex."""
-        weighted = self.triangle_normals * self.triangle_areas_mm2[:, None]
+        weighted = self._double_areas()
         summed = np.zeros_like(self.vertices_mm)
-        for corner in range(3):
-            for axis in range(3):
-                summed[:, axis] += np.bincount(self.triangles[:, corner], weighted[:, axis], len(summed))
+        for axis in range(3):
+            along = np.ascontiguousarray(weighted[:, axis])
+            for corner in range(3):
+                summed[:, axis] += np.bincount(self.triangles[:, corner], along, len(summed))
         unit: Array = summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-30)
         return unit
+
+    def _double_areas(self) -> Array:
+        """(T, 3) outward normals as long as twice the triangle's area; the cross product, but faster than numpy's."""
+        a = self.vertices_mm[self.triangles[:, 0]]
+        u, v = self.vertices_mm[self.triangles[:, 1]] - a, self.vertices_mm[self.triangles[:, 2]] - a
+        cross = np.empty_like(a)
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            np.multiply(u[:, i], v[:, j], out=cross[:, k])
+            cross[:, k] -= u[:, j] * v[:, i]
+        return cross
 
     @cached_property
     def center_mm(self) -> Array:
@@ -208,5 +218,7 @@ class Surface:
             writer = vtkXMLPolyDataWriter()
             writer.SetFileName(str(temporary))
             writer.SetInputData(self.to_polydata())
+            writer.EncodeAppendedDataOff()  # with LZ4 0.35 s for a whole skull instead of 6, in 37 MB instead of 28
+            writer.SetCompressorTypeToLZ4()
             if not writer.Write():
                 raise InputError(f"cannot write {path}; is the disk full?")
