@@ -24,9 +24,13 @@ from CranioNavLib.host import (  # noqa: E402
 from CranioNavLib.module_logic import ParametersInScene, describeModule  # noqa: E402
 from CranioNavLib.module_widget import PanelOfModule  # noqa: E402
 from CranioNavLib.panel import Level, Progress, Reading, StepState, StepStatus, Task  # noqa: E402
+from CranioNavLib.point_editor import PointEditor  # noqa: E402
+from ModuleRegistrationLib.anatomy.landmark_suggestions import LABELS  # noqa: E402
 from ModuleRegistrationLib.panel_description import PANEL, RegistrationParameters  # noqa: E402
 
 LEVELS = {"accepted": Level.GOOD, "warning": Level.WARNING, "refused": Level.BAD, "landmarks": Level.WARNING}
+LEAST_LANDMARKS = 3
+FAR_FROM_HEAD_MM = 30.0  # landmarks of the skin, the tip of the nose or the tragus, lie nearer than this to the skull's box
 # on OuterTable: what its segmentation promises
 POSITION_SD, OFFSET_SD, THRESHOLD = "CranioNav.PositionSdMm", "CranioNav.OffsetSdMm", "CranioNav.ThresholdHu"
 
@@ -58,6 +62,7 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
     def __init__(self, parent=None):
         super().__init__(parent)
         self.registered = None  # last surface registration: landmarks, result, verdict, predicted TRE
+        self.planned = PointEditor("LandmarksCT", LABELS, self._offTheHead)
 
     # Loading
 
@@ -219,6 +224,7 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
             return suggest_landmarks(bone)
 
         def take(found):
+            self.planned.remember()
             scene_data.set_points("LandmarksCT", LabelledPoints(tuple(found.labels), found.positions_ras_mm))
             return f"{', '.join(found.labels)}: suggested; check each in the views and move it where needed. {found.note}"
 
@@ -229,6 +235,107 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         if not self._lacking("LandmarksCT"):
             return "the CT has landmarks already; remove them first"
         return self._lacking("Bone", "OuterTable")
+
+    # Planned landmarks
+
+    def landmarks(self):
+        """The landmarks to place, and those that are placed."""
+        return self.planned.entries()
+
+    def landmarkChosen(self):
+        """The user chose a landmark: the slices go to it, and the next click places it. Returns a message."""
+        name = self.parameters().read().landmark
+        reason = self.segmentBoneBlocked()
+        if reason:
+            raise InputError(f"{name} cannot be placed: {reason}")
+        self._lookAt(name)
+        self.planned.place(name)
+        return f"{name}: click on it in any view"
+
+    def placing(self):
+        """Which landmark the next click places."""
+        if self.planned.said:
+            return Reading(self.planned.said, Level.BAD)
+        name = self.planned.active()
+        return Reading(f"{name}, in any view", Level.WARNING) if name else None
+
+    def placeHere(self):
+        """Place the chosen landmark where the slices cross. Returns a message."""
+        from CranioNavLib.slice_views import crossing
+
+        name, place = self._chosenLandmark(), crossing()
+        if place is None:
+            raise InputError("there are no slices that cross; show axial, sagittal and coronal slices")
+        self.planned.put(name, place)
+        following = self.planned.following(name)
+        if following:
+            self.parameters().change(landmark=following)
+        return f"{name} is placed"
+
+    def placeHereBlocked(self):
+        """Why nothing can be placed now."""
+        return self.segmentBoneBlocked()
+
+    def undoLandmark(self):
+        """Take back the last change of the landmarks."""
+        self.planned.undo()
+
+    def undoLandmarkBlocked(self):
+        """Why there is nothing to take back."""
+        return "" if self.planned.can_undo() else "no landmark has been changed"
+
+    def removeLandmark(self):
+        """Take the chosen landmark out. Returns a message."""
+        name = self._chosenLandmark()
+        self.planned.remove(name)
+        return f"{name} is taken out"
+
+    def removeLandmarkBlocked(self):
+        """Why nothing can be taken out."""
+        return self._lacking("LandmarksCT") and "no landmark is placed"
+
+    def addLandmark(self):
+        """One more landmark, which the next click places. Returns a message."""
+        self.parameters().change(landmark=self.planned.add())
+        return self.landmarkChosen()
+
+    def addLandmarkBlocked(self):
+        """Why no landmark can be placed now."""
+        return self.segmentBoneBlocked()
+
+    def stopPlacing(self):
+        """Clicks place nothing any more."""
+        self.planned.stop()
+
+    def stopPlacingBlocked(self):
+        """Why there is nothing to stop."""
+        return "" if self.planned.active() else "no landmark is being placed"
+
+    def planStatus(self):
+        """Whether there are enough landmarks to register by."""
+        placed = sum(one.done for one in self.landmarks())
+        return _step(placed >= LEAST_LANDMARKS, self.segmentBoneBlocked() or f"place {LEAST_LANDMARKS - placed} more landmarks")
+
+    def _chosenLandmark(self):
+        entries = self.landmarks()
+        chosen = self.planned.active() or self.parameters().read().landmark
+        return chosen if any(one.name == chosen for one in entries) else entries[0].name
+
+    def _lookAt(self, name):
+        from CranioNavLib.slice_views import go_to
+
+        node = scene.find("LandmarksCT")
+        index = node.GetControlPointIndexByLabel(name) if node is not None else -1
+        if index >= 0:
+            go_to(node.GetNthControlPointPositionWorld(index))
+
+    def _offTheHead(self, position):
+        """Why a place (3,) in RAS is no place for a landmark; "" if it is one."""
+        node = scene.find("Bone") or scene.find("CT")
+        bounds = [0.0] * 6
+        node.GetRASBounds(bounds)
+        inside = all(bounds[2 * k] - FAR_FROM_HEAD_MM <= position[k] <= bounds[2 * k + 1] + FAR_FROM_HEAD_MM for k in range(3))
+        return "" if inside else "the click missed the head; click on the head or on a slice through it"
 
     # Registration
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from CranioNavLib.panel import Action, FileField, NodeField, Panel, ParameterField, PluginField, ReadOut, Step
+from CranioNavLib.panel import Action, FileField, ListField, NodeField, Panel, ParameterField, PluginField, ReadOut, Step
 from CranioNavLib.parameters import Limits, Parameters
 
 from ModuleRegistrationLib.anatomy.segmentation import SEGMENTATIONS
@@ -23,6 +23,7 @@ class RegistrationParameters(Parameters):
     ct_series: Annotated[str, "number, description or UID of the series, where a folder holds several"] = ""
     segmentation: Annotated[str, "how bone is found in the CT"] = "threshold"
     marker_diameter_mm: Annotated[float, Limits(1, 20), "diameter of the titanium spheres"] = 4.0
+    landmark: Annotated[str, "planned landmark that is placed or moved next"] = ""
     # The chapter's mode IIa: a TRE of 2.78 mm with four anatomical landmarks needs about this much per landmark.
     landmark_fle_mm: Annotated[float, Limits(0.05, 20), "usual error of one landmark pair (RMS, 3-D)"] = 3.5
     palpated_sd_mm: Annotated[float, Limits(0.05, 5), "error of a point touched with the stylus, per axis"] = 0.5
@@ -64,13 +65,28 @@ PANEL = Panel(
             status="boneStatus",
         ),
         Step(
+            name="plan",
+            title="Planned landmarks",
+            help="Choose a landmark and click on the head or a slice: there it is. Choose it again to move it.",
+            items=(
+                Action("suggestLandmarks", "Suggest landmarks", "Propose landmarks on the skull; check and move each"),
+                ListField("landmark", "Landmarks", "landmarks", "A click places the landmark that is chosen"),
+                ReadOut("placing", "Click now"),
+                Action("placeHere", "Place where the slices cross", "Without a mouse: move the slices there first", "P"),
+                Action("undoLandmark", "Undo", "Take back the last change of a landmark", "Ctrl+Z"),
+                Action("removeLandmark", "Remove", "Take the chosen landmark out", "Del"),
+                Action("addLandmark", "Add a landmark", "A further point to be placed and touched"),
+                Action("stopPlacing", "Stop placing", "The mouse turns the views again", "Escape"),
+            ),
+            status="planStatus",
+        ),
+        Step(
             name="landmarks",
             title="Landmarks",
             help="Pair at least three landmarks of the CT with the same landmarks touched on the patient.",
             items=(
                 NodeField("LandmarksCT", "In the CT"),
                 NodeField("LandmarksPatient", "On the patient"),
-                Action("suggestLandmarks", "Suggest landmarks", "Propose landmarks on the skull; check and move each"),
                 ParameterField("landmark_fle_mm", "Usual error of a pair"),
                 Action("registerLandmarks", "Register landmarks", "First estimate of ReferenceToRas", primary=True),
                 ReadOut("fre", "FRE (RMS, not an accuracy)", "mm"),

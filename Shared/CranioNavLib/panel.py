@@ -12,13 +12,16 @@ What the words mean to the module's logic:
 ParameterField  a field of the panel's `Parameters` dataclass: type, limits, unit and help come from there
 FileField      the same, for a `str` parameter that holds a path
 PluginField    the same, for a `str` parameter that holds a plugin's name; the plugin's own settings are shown below it
+ListField      the same, for a `str` parameter that names one of the entries that a method of the logic lists
 NodeField      a role of the scene; the user may let another node of the same class play it
 Action         a method of the logic without arguments. It returns None, a message (str), or a `Task` for long work
 ReadOut        a method of the logic that returns a `Reading`, or None while there is nothing to show
+Picture        a method of the logic that returns a drawing as SVG text, or None while there is nothing to show
 Step.status    a method of the logic that returns a `StepStatus`
 =============  ==================================================================================================
 
-An action `loadCt` may have a companion method `loadCtBlocked()` that returns why it cannot be used now ("" if it can). A logic
+An action `loadCt` may have a companion method `loadCtBlocked()` that returns why it cannot be used now ("" if it can), and a
+list `landmark` a companion `landmarkChosen()` that is called when the user has chosen an entry. A logic
 refuses with InputError or with what its attribute `refusals` names; the text is shown, and nothing is changed. A renderer
 talks to a `PanelModel` (panel_model.py), which does all of this for it.
 """
@@ -71,6 +74,15 @@ class StepStatus:
 
 
 @dataclass(frozen=True)
+class Entry:
+    """One line of a list to choose from."""
+
+    name: str
+    done: bool = False
+    note: str = ""  # beside the name
+
+
+@dataclass(frozen=True)
 class ParameterField:
     """One parameter. Label and help may be left to the parameter's own name and help."""
 
@@ -96,6 +108,16 @@ class PluginField:
     name: str
     label: str
     kind: str  # "tracker", "amode", "registration", "segmentation"
+
+
+@dataclass(frozen=True)
+class ListField:
+    """A list with one entry chosen: a `str` parameter that holds the entry's name."""
+
+    name: str
+    label: str
+    entries: str  # method of the logic that returns a tuple of Entry
+    help: str = ""
 
 
 @dataclass(frozen=True)
@@ -128,8 +150,16 @@ class ReadOut:
     large: bool = False
 
 
-Field = Union[ParameterField, FileField, PluginField]
-Item = Union[ParameterField, FileField, PluginField, NodeField, Action, ReadOut]
+@dataclass(frozen=True)
+class Picture:
+    """A drawing shown live; `label` says what it shows, for those who do not see it."""
+
+    name: str
+    label: str
+
+
+Field = Union[ParameterField, FileField, PluginField, ListField]
+Item = Union[ParameterField, FileField, PluginField, ListField, NodeField, Action, ReadOut, Picture]
 
 
 @dataclass(frozen=True)
@@ -241,11 +271,12 @@ def check_panel(panel: Panel, logic_class: type) -> None:
         Something named is not there, or a name stands twice in a step.
     """
     missing: list[str] = []
-    methods = [item.name for item in panel.items() if isinstance(item, (Action, ReadOut))]
+    methods = [item.name for item in panel.items() if isinstance(item, (Action, ReadOut, Picture))]
+    methods += [item.entries for item in panel.items() if isinstance(item, ListField)]
     methods += [step.status for step in panel.steps if step.status]
     missing += [f"method {name}" for name in methods if not callable(getattr(logic_class, name, None))]
     for item in panel.items():
-        if isinstance(item, (ParameterField, FileField, PluginField)):
+        if isinstance(item, (ParameterField, FileField, PluginField, ListField)):
             panel.parameter(item.name)
         if isinstance(item, PluginField) and item.kind not in KINDS:
             missing.append(f"plugin kind {item.kind}")

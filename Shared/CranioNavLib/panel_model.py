@@ -16,10 +16,13 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.panel import (
     Action,
     Cancelled,
+    Entry,
     Field,
     Level,
+    ListField,
     NodeField,
     Panel,
+    Picture,
     PluginField,
     Progress,
     Reading,
@@ -106,6 +109,23 @@ class PanelModel:
         door = self.settings(field)
         return door is not None and self._store(f"{field.name}.{name}", door, name, value)
 
+    # Lists
+
+    def entries(self, field: ListField) -> tuple[Entry, ...]:
+        """What can be chosen now."""
+        try:
+            return tuple(getattr(self.logic, field.entries)())
+        except self._refusals as error:
+            self.errors[field.name] = str(error)
+            return ()
+
+    def pick(self, field: ListField, name: str) -> bool:
+        """Choose an entry, and let the logic hear of it; False, with a message, if it is refused."""
+        if not self.change(field, name):
+            return False
+        companion = getattr(self.logic, f"{field.name}Chosen", None)
+        return companion is None or self._guarded(lambda: self._say(companion() or "", Level.GOOD))
+
     # Nodes
 
     def node(self, field: NodeField) -> Any | None:
@@ -147,6 +167,13 @@ class PanelModel:
             return getattr(self.logic, read_out.name)()  # type: ignore[no-any-return]
         except self._refusals as error:
             return Reading(str(error), Level.BAD)
+
+    def drawing(self, picture: Picture) -> str | None:
+        """A picture as SVG text; None: nothing to show."""
+        try:
+            return getattr(self.logic, picture.name)()  # type: ignore[no-any-return]
+        except self._refusals:  # a read-out beside it says why
+            return None
 
     def status(self, step: Step) -> StepStatus:
         """The state of a step."""

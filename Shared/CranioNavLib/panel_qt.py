@@ -11,8 +11,10 @@ from CranioNavLib.panel import (
     FileField,
     Item,
     Level,
+    ListField,
     NodeField,
     ParameterField,
+    Picture,
     PluginField,
     ReadOut,
     Step,
@@ -21,7 +23,7 @@ from CranioNavLib.panel import (
     words_of,
 )
 from CranioNavLib.panel_model import PanelModel
-from CranioNavLib.panel_qt_widgets import Editor, NodeChooser, Section, ThreadRunner, connect, toolkit
+from CranioNavLib.panel_qt_widgets import Chooser, Drawing, Editor, NodeChooser, Section, ThreadRunner, connect, toolkit
 from CranioNavLib.parameters import ParameterInfo
 
 REFRESH_MS = 200  # live read-outs; poses are drawn by the views, not here
@@ -51,6 +53,8 @@ class PanelWidget:
         self.readings: dict[str, Any] = {}
         self.editors: dict[str, Editor] = {}
         self.choosers: dict[str, NodeChooser] = {}
+        self.lists: dict[str, Chooser] = {}
+        self.pictures: dict[str, Drawing] = {}
         self.errors: dict[str, Any] = {}
         self._settings_boxes: dict[str, tuple[Any, PluginField]] = {}
         self._shown_plugin: dict[str, str] = {}
@@ -112,6 +116,10 @@ class PanelWidget:
                 text = f"{LEVEL_SIGNS[level]}{reading.text} {item.unit}".rstrip() if reading else "–"
                 self.readings[item.name].setText(text)
                 self.readings[item.name].setStyleSheet(_style(level, item.large))
+            elif isinstance(item, Picture):
+                self.pictures[item.name].show(self.model.drawing(item))
+            elif isinstance(item, ListField):
+                self.lists[item.name].show(self.model.entries(item), self.model.value(item))
             elif isinstance(item, Action):
                 reason = self.model.blocked(item)
                 self.buttons[item.name].setEnabled(not reason)
@@ -146,6 +154,13 @@ class PanelWidget:
         elif isinstance(item, ReadOut):
             label = self.readings[item.name] = self._label("–")
             form.addRow(f"{item.label}:", label)
+        elif isinstance(item, Picture):
+            drawing = self.pictures[item.name] = Drawing(item.label)
+            form.addRow(drawing.widget)
+        elif isinstance(item, ListField):
+            shown = self.lists[item.name] = Chooser(lambda name: self.model.pick(item, name))
+            shown.widget.setToolTip(item.help)
+            form.addRow(f"{item.label}:", shown.widget)
         elif isinstance(item, NodeField):
             chooser = self.choosers[item.role] = NodeChooser(
                 scene.role(item.role).mrml_class, lambda node: self.model.choose(item, node)

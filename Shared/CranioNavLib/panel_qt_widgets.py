@@ -17,6 +17,7 @@ from typing import Any
 
 from CranioNavLib import host
 from CranioNavLib.errors import InputError
+from CranioNavLib.panel import Entry
 from CranioNavLib.parameters import ParameterInfo
 
 LOG = logging.getLogger(__name__)
@@ -185,6 +186,54 @@ class NodeChooser:
     def _node_chosen(self, node: Any) -> None:
         if not self._filling and node is not None:
             self._chosen(node)
+
+
+class Chooser:
+    """A list with one entry chosen; those that are done carry a tick."""
+
+    def __init__(self, chosen: Callable[[str], object]) -> None:
+        self.widget, self._chosen = toolkit().QListWidget(), chosen
+        self._shown: tuple[tuple[Entry, ...], str] = ((), "")
+        self.widget.setMaximumHeight(130)
+        connect(self.widget, "itemClicked(QListWidgetItem*)", lambda *_: self._clicked())
+
+    def show(self, entries: tuple[Entry, ...], chosen: str) -> None:
+        """Show the entries and which one is chosen."""
+        if (entries, chosen) == self._shown:
+            return
+        self._shown = (entries, chosen)
+        self.widget.clear()
+        for one in entries:
+            self.widget.addItem("  ".join(filter(None, ["✓" if one.done else "○", one.name, one.note])))
+        names = [one.name for one in entries]
+        self.widget.setCurrentRow(names.index(chosen) if chosen in names else -1)
+
+    def _clicked(self) -> None:
+        row = int(self.widget.property("currentRow"))
+        if 0 <= row < len(self._shown[0]):
+            self._chosen(self._shown[0][row].name)
+
+
+class Drawing:
+    """A drawing given as SVG text."""
+
+    def __init__(self, label: str) -> None:
+        self.widget = toolkit().QLabel()
+        self._shown: str | None = None
+        self.widget.setAccessibleName(label)
+        self.widget.setToolTip(label)
+        self.widget.setVisible(False)
+
+    def show(self, svg: str | None) -> None:
+        """Show another drawing, or none."""
+        if svg == self._shown:
+            return
+        self._shown = svg
+        self.widget.setVisible(bool(svg))
+        if svg:
+            picture = toolkit().QPixmap()
+            picture.loadFromData(toolkit().QByteArray(svg.encode("utf-8")), "SVG")
+            self.widget.setPixmap(picture)
 
 
 class Editor:

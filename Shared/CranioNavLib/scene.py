@@ -151,13 +151,14 @@ def release(name: str) -> None:
 
 
 class Observation:
-    """A standing wish to hear of a node's changes; `stop` ends it."""
+    """A standing wish to hear of a node's changes, or of the events of its class that are named; `stop` ends it."""
 
-    def __init__(self, node: Any, callback: Callable[[Any], None]) -> None:
+    def __init__(self, node: Any, callback: Callable[[Any], None], events: tuple[str, ...] = ()) -> None:
         from vtkmodules.vtkCommonCore import vtkCommand
 
         self._node = node
-        self._tags = [node.AddObserver(event, lambda caller, _: callback(caller)) for event in _events(node, vtkCommand)]
+        wanted = [int(getattr(type(node), event)) for event in events] or _events(node, vtkCommand)
+        self._tags = [node.AddObserver(event, lambda caller, _: callback(caller)) for event in wanted]
 
     def stop(self) -> None:
         """No more calls; may be called twice."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from CranioNavLib import host, scene_data
-from CranioNavLib.panel import Action, NodeField, ReadOut
+from CranioNavLib.panel import Action, ListField, NodeField, Picture, ReadOut
 from CranioNavLib.panel_model import PanelModel
 from CranioNavLib.slicer_files import LabelledPoints
 
@@ -76,6 +76,10 @@ def test_everything_described_is_drawn(an_empty_scene, name):
             assert f'data-reading="{item.name}"' in page
         elif isinstance(item, NodeField):
             assert f"panel.nodes['{item.role}']" in page
+        elif isinstance(item, Picture):
+            assert f'data-picture="{item.name}"' in page
+        elif isinstance(item, ListField):
+            assert f'data-list="{item.name}"' in page
         else:
             assert f'data-field="{item.name}"' in page
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 from enum import Enum
 from typing import Any
 
-from CranioNavLib.panel import Action, NodeField, PluginField, ReadOut
+from CranioNavLib.panel import Action, ListField, NodeField, Picture, PluginField, ReadOut
 from CranioNavLib.panel_model import PanelModel
 from CranioNavLib.parameters import ParameterInfo
 
@@ -18,6 +19,8 @@ def panel_state(model: PanelModel) -> dict[str, Any]:
     blocked: dict[str, str] = {}
     nodes: dict[str, str] = {}
     settings: dict[str, list[dict[str, Any]]] = {}
+    lists: dict[str, list[dict[str, Any]]] = {}
+    pictures: dict[str, str] = {}
     for item in model.panel.items():
         if isinstance(item, Action):
             blocked[item.name] = model.blocked(item)
@@ -27,7 +30,11 @@ def panel_state(model: PanelModel) -> dict[str, Any]:
         elif isinstance(item, NodeField):
             node = model.node(item)
             nodes[item.role] = node.GetName() if node is not None else "not there yet"
+        elif isinstance(item, Picture):
+            pictures[item.name] = model.drawing(item) or ""
         else:
+            if isinstance(item, ListField):
+                lists[item.name] = [asdict(one) for one in model.entries(item)]
             fields[item.name] = _plain(model.value(item))
             if isinstance(item, PluginField):
                 settings[item.name] = _settings(model, item)
@@ -37,6 +44,8 @@ def panel_state(model: PanelModel) -> dict[str, Any]:
         "blocked": blocked,
         "nodes": nodes,
         "settings": settings,
+        "lists": lists,
+        "pictures": pictures,
         "errors": dict(model.errors),
         "status": {step.name: _status(model, step) for step in model.panel.steps},
         "message": {"text": model.message.text, "level": model.message.level.value},

@@ -5,7 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from CranioNavLib.panel import Action, FileField, Item, NodeField, ParameterField, PluginField, ReadOut, Step, label_of
+from CranioNavLib.panel import (
+    Action,
+    FileField,
+    Item,
+    ListField,
+    NodeField,
+    ParameterField,
+    Picture,
+    PluginField,
+    ReadOut,
+    Step,
+    label_of,
+)
 from CranioNavLib.panel_model import PanelModel
 from trame.widgets import html
 from trame.widgets import vuetify3 as v3
@@ -40,6 +52,7 @@ class PanelView:
         model.listen(self.refresh)
         server.controller.trigger(f"{key}_change")(self._change)
         server.controller.trigger(f"{key}_setting")(self._change_setting)
+        server.controller.trigger(f"{key}_pick")(self._pick)
         server.controller.trigger(f"{key}_run")(self._run)
         server.controller.trigger(f"{key}_cancel")(self.model.cancel)
 
@@ -80,6 +93,15 @@ class PanelView:
                 html.Span(f"{{{{ {self.key}.nodes['{item.role}'] }}}}")
         elif isinstance(item, PluginField):
             self._draw_plugin(item)
+        elif isinstance(item, ListField):
+            self._draw_list(item)
+        elif isinstance(item, Picture):
+            html.Div(
+                v_html=f"{self.key}.pictures['{item.name}']",
+                v_if=f"{self.key}.pictures['{item.name}']",
+                classes="my-2 text-center",
+                raw_attrs=[f'data-picture="{item.name}"', 'role="img"', f'aria-label="{item.label}"'],
+            )
         else:
             self._draw_parameter(item)
 
@@ -136,6 +158,23 @@ class PanelView:
             entered = f"trigger('{self.key}_change', ['{item.name}', $event.target.value])"
             v3.VTextField(suffix=info.unit, change=entered, type="number" if info.kind in (int, float) else "text", **common)
 
+    def _draw_list(self, item: ListField) -> None:
+        html.Div(item.label, classes="text-caption text-medium-emphasis", title=item.help)
+        with (
+            v3.VList(density="compact", classes="py-0 my-1", raw_attrs=[f'data-list="{item.name}"']),
+            v3.VListItem(
+                v_for=f"one in {self.key}.lists['{item.name}']",
+                key="one.name",
+                active=(f"one.name === {self.key}.fields['{item.name}']",),
+                color="primary",
+                title=("(one.done ? '✓ ' : '○ ') + one.name",),
+                subtitle=("one.note",),
+                click=f"trigger('{self.key}_pick', ['{item.name}', one.name])",
+                raw_attrs=[':data-entry="one.name"'],
+            ),
+        ):
+            pass
+
     def _draw_plugin(self, item: PluginField) -> None:
         v3.VSelect(
             label=item.label,
@@ -172,7 +211,7 @@ class PanelView:
 
     def _draw_footer(self, step: Step) -> None:
         """What is running and what was last said; only at the step whose action it was."""
-        names = [item.name for item in step.items if isinstance(item, Action)]
+        names = [item.name for item in step.items if isinstance(item, (Action, ListField))]
         mine = f"{names!r}.includes({self.key}.last)"
         with html.Div(v_if=f"{self.key}.busy && {mine}", classes="my-3"):
             html.Div(f"{{{{ {self.key}.busy.text || {self.key}.busy.label }}}} …", classes="text-body-2")
@@ -199,6 +238,11 @@ class PanelView:
         if door is not None:
             info = next(one for one in door.kind.describe() if one.name == setting)
             self.model.change_setting(field, setting, parse(info, value))
+
+    def _pick(self, name: str, entry: str) -> None:
+        self._last = name
+        field = next(item for item in self.model.panel.items() if isinstance(item, ListField) and item.name == name)
+        self.model.pick(field, entry)
 
     def _run(self, name: str) -> None:
         self._last = name

@@ -19,7 +19,7 @@ HAND, SESSION, NAVIGATION = "SimulatedHand", "Session", "Navigation"
 
 PROCEDURE: tuple[ProcedureStep, ...] = (
     ProcedureStep("ct", "CT", ((SESSION, "resume"), (HAND, "patient"), (REGISTRATION, "ct"))),
-    ProcedureStep("bone", "Bone and markers", ((REGISTRATION, "bone"),)),
+    ProcedureStep("bone", "Bone and landmarks", ((REGISTRATION, "bone"), (REGISTRATION, "plan"))),
     ProcedureStep("devices", "Devices", ((TRACKING, "tracker"), (ULTRASOUND, "device"))),
     ProcedureStep("calibration", "Calibration", ((HAND, "pivot"), (TRACKING, "calibration"))),
     ProcedureStep("landmarks", "Landmarks", ((HAND, "landmarks"), (TRACKING, "points"), (REGISTRATION, "landmarks"))),

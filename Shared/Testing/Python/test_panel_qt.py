@@ -14,7 +14,7 @@ pytest.importorskip("PySide6.QtWidgets", exc_type=ImportError)
 
 from CranioNavLib import host, panel_qt_widgets, scene, scene_data
 from CranioNavLib.host import ScriptedLoadableModuleWidget
-from CranioNavLib.panel import Action, NodeField, ReadOut, StepState, check_panel
+from CranioNavLib.panel import Action, ListField, NodeField, Picture, ReadOut, StepState, check_panel
 from CranioNavLib.panel_model import PanelModel
 from CranioNavLib.panel_qt import PanelWidget
 from CranioNavLib.slicer_files import LabelledPoints
@@ -78,6 +78,10 @@ def test_everything_described_is_drawn(a_drawn_panel):
             assert a_drawn_panel.readings[item.name].text()
         elif isinstance(item, NodeField):
             assert a_drawn_panel.choosers[item.role].widget.count() >= 1
+        elif isinstance(item, Picture):
+            assert a_drawn_panel.pictures[item.name].widget.accessibleName() == item.label
+        elif isinstance(item, ListField):
+            assert a_drawn_panel.lists[item.name].widget.count() == len(a_drawn_panel.model.entries(item))
         else:
             assert item.name in a_drawn_panel.editors or item.name in a_drawn_panel.choosers
 
@@ -135,6 +139,27 @@ def test_a_click_registers_landmarks_as_a_call_of_the_logic_does(a_registration_
     scene.release("ReferenceToRas")
     a_registration_panel.model.logic.registerLandmarks()
     np.testing.assert_array_equal(scene_data.get_transform("ReferenceToRas"), clicked)
+
+
+def test_choosing_in_a_list_reaches_the_scene_and_the_logic_hears_of_it(a_registration_panel):
+    from CranioNavLib.volume import Volume
+
+    scene_data.set_volume("CT", Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), "nothing"))
+    shown = a_registration_panel.lists["landmark"].widget
+    shown.setCurrentRow(1)
+    shown.itemClicked.emit(shown.currentItem())
+    logic = a_registration_panel.model.logic
+    assert logic.parameters().read().landmark == "Left frontozygomatic"
+    assert logic.planned.active() == "Left frontozygomatic"
+    assert "click on it" in a_registration_panel.model.message.text
+
+
+def test_a_drawing_given_as_svg_is_shown(qt):
+    drawing = panel_qt_widgets.Drawing("A square")
+    drawing.show('<svg xmlns="http://www.w3.org/2000/svg" width="40" height="30"><rect width="40" height="30" fill="red"/></svg>')
+    assert (drawing.widget.pixmap().width(), drawing.widget.pixmap().height()) == (40, 30)
+    drawing.show(None)
+    assert not drawing.widget.isVisible()
 
 
 def test_a_refusal_is_shown_in_words(a_registration_panel):
