@@ -11,7 +11,7 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.surface import Surface
 from CranioNavLib.volume import Volume
 
-from ModuleRegistrationLib.anatomy.grid import Floats, Grid, Mask, pooled, spread, subsampled
+from ModuleRegistrationLib.anatomy.grid import Floats, Grid, Mask, pooled, subsampled
 from ModuleRegistrationLib.anatomy.head import COARSE_MM, Head
 
 SOFT_RANGE_HU = (-150, 150)  # where the soft tissue's peak is looked for
@@ -124,14 +124,25 @@ def bone_voxels(volume: Volume, head: Head, threshold_hu: float, soft_hu: float)
     centers = [np.minimum((np.arange(n) * s + s // 2 + part.start) // c, m - 1)
                for n, s, c, m, part in zip(blocks.shape, fine, coarse, inside.shape, box)]  # fmt: skip
     kept = _pieces(blocks & inside[np.ix_(*centers)], SMALLEST_PIECE_ML * 1000 / (grid.voxel_mm3 * float(np.prod(fine))))
-    dense_kept = spread(kept, fine, cut.shape) & dense
-    if np.count_nonzero(dense_kept) * grid.voxel_mm3 < SMALLEST_BONE_ML * 1000:
-        raise InputError(f"the CT holds no skull denser than {threshold_hu:.0f} HU; lower the threshold or give a head CT in HU")
     hu = np.full(tuple(n + 2 for n in cut.shape), AIR_HU, dtype=np.int16)
     inner = hu[1:-1, 1:-1, 1:-1]
     inner[...] = cut
-    inner[dense & ~dense_kept] = int(min(soft_hu, threshold_hu - 1))
+    lowered = _lower(inner, blocks & ~kept, fine, threshold_hu, int(min(soft_hu, threshold_hu - 1)))
+    if (np.count_nonzero(dense) - lowered) * grid.voxel_mm3 < SMALLEST_BONE_ML * 1000:
+        raise InputError(f"the CT holds no skull denser than {threshold_hu:.0f} HU; lower the threshold or give a head CT in HU")
     return BoneVoxels(hu, (box[0].start, box[1].start, box[2].start), grid, threshold_hu, soft_hu)
+
+
+def _lower(hu: npt.NDArray[np.int16], blocks: Mask, strides: tuple[int, int, int], threshold_hu: float, level_hu: int) -> int:
+    """Set to `level_hu` what is at least `threshold_hu` in the marked blocks; how many voxels that were."""
+    first, count = np.argwhere(blocks) * np.array(strides), 0
+    for offset in np.ndindex(*strides):
+        place = first + np.array(offset)
+        place = place[(place < np.array(hu.shape)).all(axis=1)]
+        place = place[hu[tuple(place.T)] >= threshold_hu]
+        hu[tuple(place.T)] = level_hu
+        count += len(place)
+    return count
 
 
 def bone_mesh(voxels: BoneVoxels) -> BoneMesh:

@@ -13,6 +13,7 @@ from CranioNavLib.rigid import Array
 from ModuleRegistrationLib.anatomy.bone import BoneMesh, BoneVoxels
 from ModuleRegistrationLib.anatomy.grid import Floats
 from ModuleRegistrationLib.anatomy.outer_table import Triangles
+from ModuleRegistrationLib.anatomy.side_by_side import in_parts
 
 STEP_MM = 0.25
 INWARDS_MM, OUTWARDS_MM = 3.0, 3.0  # the profile across the surface: an outer table is 1 to 3 mm thick, a scalp 3 mm and more
@@ -44,8 +45,12 @@ def edge_shift(points: Floats, normals: Floats, voxels: BoneVoxels) -> Floats:
     scale = (1 / voxels.grid.spacing_mm[::-1]).astype(np.float32)
     start, along = (points - voxels.corner_mm) * scale, normals * scale
     profile = np.empty((len(steps), len(points)), dtype=np.float32)
-    for row, step in zip(profile, steps):
-        map_coordinates(voxels.hu, (start + step * along).T[::-1], output=row, order=1, mode="nearest")
+
+    def fill(part: slice) -> None:
+        for row, step in zip(profile[:, part], steps):
+            map_coordinates(voxels.hu, (start[part] + step * along[part]).T[::-1], output=row, order=1, mode="nearest")
+
+    in_parts(fill, len(points))
     inner = steps <= PEAK_OUTWARDS_MM
     peak_at = np.argmax(profile[inner], axis=0)
     peak = np.take_along_axis(profile, peak_at[None], axis=0)[0]

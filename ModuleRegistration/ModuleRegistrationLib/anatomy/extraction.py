@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Optional
 
@@ -35,6 +36,7 @@ def extract(volume: Volume, threshold_hu: Optional[float] = None) -> Extraction:
     head = find_head(volume)
     soft_hu, automatic_hu, bone_hu = tissue_levels(volume, head)
     voxels = bone_voxels(volume, head, automatic_hu if threshold_hu is None else threshold_hu, soft_hu)
-    mesh = bone_mesh(voxels)
-    barred = barred_cells(volume, head, voxels, bone_hu)
-    return Extraction(head, voxels, mesh, outer_table(mesh, voxels, head, barred), bone_hu)
+    with ThreadPoolExecutor(1) as beside:
+        barred = beside.submit(barred_cells, volume, head, voxels, bone_hu)
+        mesh = bone_mesh(voxels)
+        return Extraction(head, voxels, mesh, outer_table(mesh, voxels, head, barred.result()), bone_hu)

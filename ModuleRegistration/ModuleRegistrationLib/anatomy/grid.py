@@ -112,14 +112,6 @@ def pooled(mask: Mask, strides: tuple[int, int, int]) -> Mask:
     return mask
 
 
-def spread(blocks: npt.NDArray[Any], strides: tuple[int, int, int], shape: tuple[int, ...]) -> npt.NDArray[Any]:
-    """The value of each voxel's block: undoes `pooled` to the given shape."""
-    for axis, (stride, size) in enumerate(zip(strides, shape)):
-        if stride > 1:
-            blocks = np.take(blocks, np.minimum(np.arange(size) // stride, blocks.shape[axis] - 1), axis=axis)
-    return blocks
-
-
 def nearest_voxels(points: npt.NDArray[Any], spacing_mm: Array, shape: tuple[int, ...]) -> npt.NDArray[np.int32]:
     """(N,) flat subscripts of the voxels nearest to points (N, 3) in grid mm; those outside go to the border."""
     flat = np.zeros(len(points), dtype=np.int32)

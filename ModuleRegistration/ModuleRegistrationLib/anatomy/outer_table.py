@@ -14,6 +14,7 @@ from CranioNavLib.errors import InputError
 from ModuleRegistrationLib.anatomy.bone import BoneMesh, BoneVoxels
 from ModuleRegistrationLib.anatomy.grid import Floats, Grid, Mask
 from ModuleRegistrationLib.anatomy.head import Head
+from ModuleRegistrationLib.anatomy.side_by_side import in_parts
 
 REACH_MM = 24.0  # soft tissue over the temple with its muscle is up to 15 mm; some more for a swollen scalp
 FACING_COSINE = 0.5  # 60 deg: a wall steeper to the skin than this gives no echo and is no place to touch
@@ -43,9 +44,10 @@ def outer_table(mesh: BoneMesh, voxels: BoneVoxels, head: Head, barred: Mask) ->
         Hardly anything can be reached: the volume is no head, or shows too little of it.
     """
     reachable = reachable_vertices(mesh, voxels, head, barred)
-    triangles = mesh.triangles[_corners(reachable, mesh.triangles) > 0]  # the others share no corner with those kept
-    triangles = _without_margins(mesh.points, triangles, _corners(reachable, triangles) == 3)
-    triangles = _large_patches(mesh.points, triangles)
+    corners = _corners(reachable, mesh.triangles)
+    kept, torn = mesh.triangles[corners == 3], mesh.triangles[(corners == 1) | (corners == 2)]
+    kept = _without_margins(mesh.points, kept, torn, head, voxels.grid)
+    triangles = _large_patches(mesh.points, kept)
     if len(triangles) == 0:
         raise InputError("no part of the bone can be reached from the skin; the CT shows too little of the head's outside")
     return triangles
@@ -64,7 +66,12 @@ def reachable_vertices(mesh: BoneMesh, voxels: BoneVoxels, head: Head, barred: M
     ends = mesh.points[found] + (depth + BEYOND_MM)[:, None] * towards
     leaves = head.depth_mm.ravel()[head.cells(ends, grid)] < AT_SKIN_MM  # not at the volume's end
     found, towards, depth = found[leaves], towards[leaves], depth[leaves]
-    clear = _clear_of_bone(mesh.points[found], mesh.normals[found], towards, depth, voxels)
+
+    def clear_of_bone(part: slice) -> Mask:
+        these = found[part]
+        return _clear_of_bone(mesh.points[these], mesh.normals[these], towards[part], depth[part], voxels)
+
+    clear = np.concatenate(in_parts(clear_of_bone, len(found)))
     reachable = np.zeros(len(mesh.points), dtype=bool)
     reachable[found[clear]] = True
     return reachable
@@ -101,23 +108,33 @@ def _clear_of_bone(points: Floats, normals: Floats, towards: Floats, depth: Floa
     return clear
 
 
-def _without_margins(points: Floats, triangles: Triangles, kept: Mask) -> Triangles:
-    """The kept ones of the triangles, without those near the edge of an opening."""
+def _without_margins(points: Floats, kept: Triangles, torn: Triangles, head: Head, grid: Grid) -> Triangles:
+    """The kept triangles without those near the edge of an opening; `torn` are those that the edge runs through."""
+    from scipy import ndimage
     from scipy.spatial import cKDTree
 
     inside, outside = np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
-    inside[triangles[kept].ravel()] = True
-    outside[triangles[~kept].ravel()] = True
+    inside[kept.ravel()] = True
+    outside[torn.ravel()] = True
     edge = inside & outside
-    openings = _long_edges(points, triangles[_corners(edge, triangles) >= 2], edge)
+    along = np.concatenate([kept[_corners(edge, kept) >= 2], torn[_corners(edge, torn) >= 2]])
+    openings = _long_edges(points, along, edge)
     if len(openings) == 0:
-        return triangles[kept]
+        return kept
+    cells = np.zeros(head.grid.shape, dtype=bool)  # only in these can a point be that near
+    cells.ravel()[head.cells(openings, grid)] = True
+    cells = ndimage.binary_dilation(cells, np.ones((3, 3, 3)), iterations=_cells(MARGIN_MM, head.grid))
     inner = np.flatnonzero(inside)
+    inner = inner[cells.ravel()[head.cells(points[inner], grid)]]
     distance, _ = cKDTree(openings).query(points[inner], distance_upper_bound=MARGIN_MM)
     near = np.zeros(len(points), dtype=bool)
     near[inner[np.isfinite(distance)]] = True
-    result: Triangles = triangles[kept & (_corners(near, triangles) == 0)]
+    result: Triangles = kept[_corners(near, kept) == 0]
     return result
+
+
+def _cells(length_mm: float, grid: Grid) -> int:
+    return int(np.ceil(length_mm / grid.spacing_mm.min()))
 
 
 def _long_edges(points: Floats, along: Triangles, edge: Mask) -> Floats:
