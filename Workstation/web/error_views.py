@@ -1,0 +1,161 @@
+"""The error in the 3-D view: the skull coloured by the error to expect there, or the bone points by their residuals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from CranioNavLib import host, scene, scene_data
+from CranioNavLib.rigid import Array, transform_points
+
+from Workstation.web.color_scale import color_by, gradient, ticks
+
+MAP, RESIDUALS, NONE = "map", "residuals", "none"
+MOST_MM = {MAP: 5.0, RESIDUALS: 2.0}  # the scale's end
+ERROR = "Expected error (mm)"
+RESIDUAL = "Residual (mm)"
+LEAST_SD_MM = 0.3  # of a point along the bone's normal: the surface is no better
+USED_MM, REJECTED_MM = 2.2, 3.2  # half the size of a point as drawn
+
+
+class ErrorViews:
+    """Colours the bone as drawn, and draws the registered points; computes only what has changed."""
+
+    def __init__(self) -> None:
+        self._mapped: Any = None
+        self._residuals: Any = None
+        self._points: Any = None
+
+    def refresh(self, bone: Any, wanted: str) -> dict[str, Any] | None:
+        """Show one of MAP, RESIDUALS, NONE on the model node `bone`; returns the legend, or None without one."""
+        has_map = wanted == MAP and bone is not None and self._map(bone)
+        if bone is not None and bone.GetDisplayNode().GetScalarVisibility() != int(has_map):
+            bone.GetDisplayNode().SetScalarVisibility(has_map)
+        has_points = wanted == RESIDUALS and self._draw_points()
+        if self._points is not None and self._points.GetScene() is not None:
+            self._points.GetDisplayNode().SetVisibility(has_points)
+        if has_map:
+            taken = self._mapped[3]
+            note = f"expected with the {taken} points taken" if taken else ""
+            return _legend("Expected error, 95 %", MAP, note)
+        if has_points:
+            rejected = scene_data.get_table("Residuals")["used"].count("no")
+            return _legend("Distance of a bone point to the bone", RESIDUALS, f"crosses: {rejected} left out" if rejected else "")
+        return None
+
+    def _map(self, bone: Any) -> bool:
+        """Whether the bone carries the error to expect; computed if it is another one."""
+        from ModuleRegistrationLib.registration.error_theory import predict_tre
+        from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
+
+        known, mesh = scene_data.get_motion_error(), bone.GetPolyData()
+        if known is None or mesh is None or not mesh.GetNumberOfPoints():
+            return False
+        node = scene.find("SurfacePoints") if _landmarks_alone() else None
+        taken = node.GetNumberOfControlPoints() if node is not None else 0
+        last = node.GetNthControlPointPosition(taken - 1) if taken else ()
+        motion = scene.find("ReferenceToRas").GetAttribute(scene_data.MOTION_ERROR)
+        stamp = (mesh, motion, tuple(last), taken)
+        if self._mapped == stamp:
+            return True
+        vertices = vtk_to_numpy(mesh.GetPoints().GetData()).astype(float)
+        normals = vtk_to_numpy(mesh.GetPointData().GetNormals()).astype(float)
+        covariance, pivot, freedom = known
+        if taken:
+            covariance = _with_points_taken(covariance, pivot, vertices, normals)
+        errors = numpy_to_vtk(predict_tre(covariance, pivot, vertices, freedom).p95_mm, deep=True)
+        errors.SetName(ERROR)
+        mesh.GetPointData().AddArray(errors)
+        mesh.Modified()
+        color_by(bone, ERROR, MOST_MM[MAP])
+        self._mapped = stamp
+        return True
+
+    def _draw_points(self) -> bool:
+        """Whether there are registered points to be drawn by residual; drawn anew if they are others."""
+        registered, table = scene.find("RegisteredPoints"), scene.find("Residuals")
+        if registered is None or table is None:
+            return False
+        stamp = (registered.GetID(), table.GetID(), table.GetTable().GetMTime())
+        if self._residuals == stamp and self._points is not None and self._points.GetScene() is not None:
+            return True
+        columns = scene_data.get_table("Residuals")
+        used = np.array([one == "yes" for one in columns["used"]])
+        positions = scene_data.get_points("RegisteredPoints").positions_mm
+        if len(positions) != len(used):
+            return False
+        if self._points is None or self._points.GetScene() is None:
+            self._points = host.scene().AddNewNodeByClass("vtkMRMLModelNode", "Bone points by residual")
+            self._points.CreateDefaultDisplayNodes()
+            self._points.SetSelectable(False)
+            self._points.SetSaveWithScene(False)
+        self._points.SetAndObservePolyData(residual_glyphs(positions, np.abs(columns["residual (mm)"]), used))
+        color_by(self._points, RESIDUAL, MOST_MM[RESIDUALS])
+        self._residuals = stamp
+        return True
+
+
+def residual_glyphs(positions_mm: Array, residuals_mm: Array, used: Array) -> Any:
+    """A ball for each point used and a cross of three bars for each one left out, with the residual as scalars."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkFiltersCore import vtkAppendPolyData
+    from vtkmodules.vtkFiltersSources import vtkCubeSource, vtkSphereSource
+
+    together = vtkAppendPolyData()
+    for position, residual, is_used in zip(positions_mm, residuals_mm, used, strict=True):
+        sources = []
+        if is_used:
+            ball = vtkSphereSource()
+            ball.SetRadius(USED_MM)
+            ball.SetThetaResolution(12)
+            ball.SetPhiResolution(8)
+            ball.SetCenter(*position)
+            sources = [ball]
+        else:
+            for axis in range(3):
+                bar = vtkCubeSource()
+                lengths = [0.8] * 3
+                lengths[axis] = 2 * REJECTED_MM
+                bar.SetXLength(lengths[0])
+                bar.SetYLength(lengths[1])
+                bar.SetZLength(lengths[2])
+                bar.SetCenter(*position)
+                sources.append(bar)
+        for source in sources:
+            source.Update()
+            shape = source.GetOutput()
+            values = numpy_to_vtk(np.full(shape.GetNumberOfPoints(), float(residual)), deep=True)
+            values.SetName(RESIDUAL)
+            shape.GetPointData().AddArray(values)
+            together.AddInputData(shape)
+    together.Update()
+    return together.GetOutput()
+
+
+def _landmarks_alone() -> bool:
+    """Whether the registration in force is the landmarks', and no surface registration has judged the points yet."""
+    from ModuleRegistrationLib.result_tables import QUANTITY, STATUS
+
+    if scene.find("ReferenceToRas").GetAttribute(scene.STATUS_ATTRIBUTE) != "landmarks":
+        return False
+    return scene.find("Results") is None or STATUS not in scene_data.get_table("Results").get(QUANTITY, [])
+
+
+def _with_points_taken(covariance: Array, pivot: Array, vertices: Array, normals: Array) -> Array:
+    """The covariance to expect with the bone points that are in the scene."""
+    from ModuleRegistrationLib.registration.prospect import covariance_with_points
+    from scipy.spatial import cKDTree
+
+    points, matrix = scene_data.get_bone_points("SurfacePoints", LEAST_SD_MM), scene_data.get_transform("ReferenceToRas")
+    positions = transform_points(matrix, points.positions_mm)
+    across = normals[cKDTree(vertices).query(positions)[1]]
+    in_reference = across @ matrix[:3, :3]  # the same normals, turned back
+    variances = np.einsum("ni,nij,nj->n", in_reference, points.covariances_mm2, in_reference)
+    known = np.isfinite(points.depths_mm) & np.isfinite(points.speed_of_sound_m_s)
+    share = points.speed_of_sound_sd_m_s / points.speed_of_sound_m_s if known.any() else 0.0
+    common = np.where(known, np.nan_to_num(points.depths_mm) * share, 0.0)
+    return covariance_with_points(covariance, pivot, positions, across, np.sqrt(variances + LEAST_SD_MM**2), common)
+
+
+def _legend(title: str, kind: str, note: str) -> dict[str, Any]:
+    return {"title": title, "gradient": gradient(), "ticks": ticks(MOST_MM[kind]), "note": note}

@@ -1,0 +1,89 @@
+"""How each list of points looks and in which steps it is seen: shapes differ as well as colours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from CranioNavLib import scene
+
+from Workstation.web.tool_models import registered
+
+LATER = ("verification", "navigation", "report")
+
+
+@dataclass(frozen=True)
+class PointStyle:
+    """Of one role."""
+
+    size_mm: float
+    glyph: str  # of vtkMRMLMarkupsDisplayNode
+    steps: tuple[str, ...]  # of the procedure in which they are seen
+    named_in: tuple[str, ...] = ()  # steps in which the names stand beside them
+
+
+STYLES = {
+    "LandmarksCT": PointStyle(5.0, "Sphere3D", ("ct", "bone", "devices", "calibration", "landmarks"), ("bone", "landmarks")),
+    "LandmarksPatient": PointStyle(6.0, "ThickCross2D", ("landmarks",)),
+    "TargetsCT": PointStyle(4.0, "Diamond2D", ("bone", *LATER), ("navigation",)),
+    "TargetsPatient": PointStyle(4.0, "ThickCross2D", ("verification",)),
+    "ProtocolPoints": PointStyle(5.0, "Sphere3D", ("ultrasound",)),
+    "SurfacePoints": PointStyle(4.0, "ThickCross2D", ("ultrasound",)),
+    "RegisteredPoints": PointStyle(3.5, "Sphere3D", ("ultrasound", "verification")),
+    "PlausibilityPoints": PointStyle(4.0, "Square2D", ("verification",)),
+}
+ASKED_FOR = (1.0, 0.85, 0.2)  # the planned point to palpate now
+
+
+class PointStyles:
+    """Gives every list its looks once, and shows it where it belongs."""
+
+    def __init__(self) -> None:
+        self._styled: set[str] = set()
+
+    def refresh(self, step: str, residuals_drawn: bool, asked_for: int) -> None:
+        """For the open step; `asked_for` is the index of the planned point to palpate now, or -1."""
+        for role, style in STYLES.items():
+            node = scene.find(role)
+            if node is None or node.GetDisplayNode() is None:
+                continue
+            if node.GetID() not in self._styled:
+                _style(node, style)
+                self._styled.add(node.GetID())
+            known = scene.role(role).parent == "" or registered()  # the patient's place is not known before
+            _set(node.GetDisplayNode(), "Visibility", step in style.steps and known and not _replaced(role, residuals_drawn))
+            _set(node.GetDisplayNode(), "PointLabelsVisibility", step in style.named_in)
+            _set(node, "Locked", not (role == "LandmarksCT" and step == "bone"))  # dragged only where they are planned
+        _mark(scene.find("ProtocolPoints"), asked_for)
+
+
+def _replaced(role: str, residuals_drawn: bool) -> bool:
+    """Planned and raw points give way to those that were registered, these to their residuals."""
+    if role in ("ProtocolPoints", "SurfacePoints"):
+        return scene.find("RegisteredPoints") is not None
+    return role == "RegisteredPoints" and residuals_drawn
+
+
+def _style(node: Any, style: PointStyle) -> None:
+    display = node.GetDisplayNode()
+    display.SetUseGlyphScale(False)
+    display.SetGlyphSize(style.size_mm)
+    display.SetGlyphType(getattr(display, style.glyph))
+    display.SetTextScale(4.0)
+    display.SetPropertiesLabelVisibility(False)
+    if node.GetAttribute(scene.ROLE_ATTRIBUTE) == "ProtocolPoints":
+        display.SetSelectedColor(*ASKED_FOR)  # selected is the one asked for
+
+
+def _mark(node: Any, asked_for: int) -> None:
+    if node is None:
+        return
+    for index in range(node.GetNumberOfControlPoints()):
+        if node.GetNthControlPointSelected(index) != (index == asked_for):
+            node.SetNthControlPointSelected(index, index == asked_for)
+
+
+def _set(node: Any, name: str, value: bool) -> None:
+    """Only when it differs: every write draws the views anew."""
+    if getattr(node, f"Get{name}")() != int(value):
+        getattr(node, f"Set{name}")(bool(value))

@@ -1,0 +1,89 @@
+"""The title bar's buttons for the views and the sound; each has a key, which the list behind "?" names."""
+
+from __future__ import annotations
+
+from trame.widgets import html
+from trame.widgets import vuetify3 as v3
+
+from Workstation.web.error_views import MAP, NONE, RESIDUALS
+from Workstation.web.view_controls import LAYOUTS, WINDOWS
+
+# (key, what it does) of what the keys of the page do in every step
+KEYS = (
+    *((choice.key, choice.title) for choice in LAYOUTS.values()),
+    ("W", "Next grey window: " + ", ".join(window.title.lower() for window in WINDOWS.values())),
+    ("D", "Dragging in a slice sets the grey window, or no longer"),
+    ("R", "Reset all views"),
+    ("E", "In colours: expected error on the skull, distance of the bone points, or nothing"),
+    ("M", "Sounds on or off"),
+    ("N", "Next step"),
+    ("B", "Step before"),
+    ("Arrows, Page up/down", "Move the slices by 1 mm (Shift: 10 mm), where the step itself has no use for the key"),
+)
+
+
+def draw_toolbar() -> None:
+    """The buttons, in the current trame context."""
+    with v3.VBtnToggle(
+        model_value=("layout",),
+        update_modelValue="$event && trigger('view_layout', [$event])",
+        density="compact",
+        variant="text",
+        classes="mr-3",
+        raw_attrs=["data-layouts"],
+    ):
+        for name, choice in LAYOUTS.items():
+            v3.VBtn(
+                icon=choice.icon,
+                value=name,
+                title=f"{choice.title} ({choice.key})",
+                size="small",
+                raw_attrs=[f'data-key="{choice.key}"'],
+            )
+    with v3.VBtnToggle(
+        model_value=("window",),
+        update_modelValue="$event && trigger('view_window', [$event])",
+        density="compact",
+        variant="text",
+        classes="mr-1",
+        raw_attrs=["data-windows"],
+    ):
+        for name, window in WINDOWS.items():
+            v3.VBtn(window.title, value=name, title=f"Grey window for {window.title.lower()} (W: the next)", size="small")
+    html.Button(style="display: none", click="trigger('view_window', [''])", raw_attrs=['data-key="W"'])
+    _switch("drag_window", "mdi-contrast-circle", "Dragging in a slice sets the grey window (D)", "D", "view_drag")
+    v3.VBtn(
+        icon="mdi-fit-to-screen-outline",
+        size="small",
+        title="Reset all views (R)",
+        click="trigger('view_reset')",
+        raw_attrs=['data-key="R"'],
+    )
+    v3.VBtn(
+        icon=(f"({{ {MAP}: 'mdi-gradient-horizontal', {RESIDUALS}: 'mdi-dots-hexagon', {NONE}: 'mdi-palette' }})[error_shown]",),
+        size="small",
+        title="In colours: expected error on the skull, distance of the bone points, or nothing (E)",
+        color=(f"error_shown === '{NONE}' ? undefined : 'primary'",),
+        click=f"error_shown = {{ {MAP}: '{RESIDUALS}', {RESIDUALS}: '{NONE}', {NONE}: '{MAP}' }}[error_shown]",
+        raw_attrs=['data-key="E"', ':data-error="error_shown"'],
+    )
+    v3.VBtn(
+        icon=("muted ? 'mdi-volume-off' : 'mdi-volume-high'",),
+        size="small",
+        title="Sounds on or off (M)",
+        click="muted = !muted",
+        color=("muted ? 'warning' : undefined",),
+        raw_attrs=['data-key="M"', "data-mute"],
+    )
+
+
+def _switch(name: str, icon: str, title: str, key: str, trigger: str = "") -> None:
+    v3.VBtn(
+        icon=icon,
+        size="small",
+        title=title,
+        color=(f"{name} ? 'primary' : undefined",),
+        variant=(f"{name} ? 'tonal' : 'text'",),
+        click=f"trigger('{trigger}', [!{name}])" if trigger else f"{name} = !{name}",
+        raw_attrs=[f'data-key="{key}"', f'data-switch="{name}"'],
+    )

@@ -1,0 +1,48 @@
+"""What is written over each view by the page: its name, the sides of the patient, the slice's slider, the colour scale."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from trame.widgets import html
+from trame_slicer.app.logic.slice_view_logic import connect_slice_view_slider_to_state
+from trame_slicer.app.ui.slider import Slider
+
+SIDES = {  # left, right, top and bottom of a slice as radiology shows it
+    "Axial": ("R", "L", "A", "P"),
+    "Coronal": ("R", "L", "S", "I"),
+    "Sagittal": ("A", "P", "S", "I"),
+}
+PLACES = (
+    "left: 8px; top: 50%; transform: translateY(-50%)",
+    "right: 8px; top: 50%; transform: translateY(-50%)",
+    "left: 50%; top: 4px; transform: translateX(-50%)",
+    "left: 50%; bottom: 34px; transform: translateX(-50%)",
+)
+STYLE = """
+.over { position: absolute; pointer-events: none; color: #e8eef2; text-shadow: 0 0 4px #000, 0 0 2px #000; font-size: 18px; }
+.over-name { left: 8px; top: 4px; font-size: 15px; opacity: 0.85; }
+.legend { left: 12px; bottom: 10px; width: 240px; font-size: 15px; }
+.legend-bar { height: 12px; border: 1px solid #90a4ae; }
+"""
+LEGEND = """
+<div>{{ legend.title }}</div>
+<div class="legend-bar" :style="{ background: legend.gradient }"></div>
+<div class="d-flex justify-space-between"><span v-for="one in legend.ticks" :key="one">{{ one }}</span></div>
+<div v-if="legend.note">{{ legend.note }}</div>"""
+
+
+def slice_frame(server: Any, view_id: str, view: Any) -> None:
+    """Over a slice view."""
+    name = view.get_orientation()
+    html.Div(name, classes="over over-name")
+    for side, place in zip(SIDES.get(name, ()), PLACES, strict=False):
+        html.Div(side, classes="over", style=place)
+    with html.Div(classes="slice-slider-gutter", style="position: absolute; bottom: 0; left: 0; width: 100%;"):
+        Slider(classes="slice-slider", typed_state=connect_slice_view_slider_to_state(server, view), theme="dark", dense=True)
+
+
+def threed_frame(server: Any, view_id: str, view: Any) -> None:
+    """Over a 3-D view."""
+    html.Div("3-D", classes="over over-name")
+    html.Div(LEGEND, v_if="legend", classes="over legend", raw_attrs=["data-legend"])
