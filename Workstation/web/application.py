@@ -14,6 +14,7 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.panel import Panel
 from CranioNavLib.panel_model import PanelModel
 from trame.app import TrameApp
+from trame_slicer.app.logic import get_view_trame_id
 
 from Workstation.web.background import BackgroundRunner
 from Workstation.web.drawings import drawings
@@ -22,6 +23,7 @@ from Workstation.web.panel_view import PanelView
 from Workstation.web.procedure import HAND, NAVIGATION, PROCEDURE, REGISTRATION, SESSION, TRACKING, ULTRASOUND
 from Workstation.web.session_folder import SessionFolder, new_folder
 from Workstation.web.session_panel import SessionLogic
+from Workstation.web.session_windows import Windows
 from Workstation.web.views import ViewFollower, registered
 
 POLL_S = 0.04  # devices: at least 20 updates a second reach the views
@@ -39,6 +41,8 @@ class WorkstationApp(TrameApp):
         from trame_slicer import module as slicer_views
 
         self.server.enable_module(slicer_views)
+        self.windows = Windows(self.server.state, self._draw_again)
+        self.server.add_protocol_to_configure(lambda protocol: protocol.registerLinkProtocol(self.windows))
         with host.quiet():
             self._make_views()
         self.runner = BackgroundRunner()
@@ -107,6 +111,12 @@ class WorkstationApp(TrameApp):
             except Exception:  # a read-out's defect must not end tracking
                 LOG.exception("the page could not be brought up to date")
 
+    def _draw_again(self, area: str) -> None:
+        """Send the picture of a view, or of all, to a window that has none yet."""
+        for view in self.slicer.view_manager.get_views():
+            if not area or get_view_trame_id(self.server, view) == area:
+                view.schedule_render()
+
     def _poll(self) -> None:
         """Take over what the devices have to say. Not drawn while a tool's place in the CT is not known."""
         self.budget.muted = not registered()
@@ -129,6 +139,7 @@ class WorkstationApp(TrameApp):
                 panel.refresh()
         if turn % SAVE_EVERY == 0:
             self._save()
+            self.windows.drop_stalled()
 
     def _forerun_mm(self) -> float:
         """Of the probe that is connected, else 0."""

@@ -25,7 +25,7 @@ window.addEventListener('keydown', (event) => {
   const name = (event.ctrlKey ? 'Ctrl+' : '') + (named.length === 1 ? named.toUpperCase() : named);
   if (named === 'Space' && at.matches && at.matches('button:focus-visible, a:focus-visible, [tabindex]:focus-visible')) return;
   const button = [...document.querySelectorAll('[data-shortcut]')].find(
-    (one) => one.dataset.shortcut === name && one.getClientRects().length);
+    (one) => one.dataset.shortcut === name && one.getClientRects().length && !one.closest('[inert]'));
   if (!button) return;
   event.preventDefault();
   if (document.activeElement) document.activeElement.blur();

@@ -13,6 +13,7 @@ from Workstation.web.drawings_view import draw_live
 from Workstation.web.keyboard import draw_help
 from Workstation.web.panel_view import PanelView
 from Workstation.web.procedure import HAND, ProcedureStep
+from Workstation.web.session_link import draw_link
 
 SIGN_OF = "({ 'to do': '○', 'done': '✓', 'needs attention': '!' })"
 COLOR_OF = "({ 'to do': undefined, 'done': '#2fbf8f', 'needs attention': '#f0b429' })"
@@ -47,6 +48,7 @@ class Page:
     def _draw_title(self, procedure: tuple[ProcedureStep, ...]) -> None:
         with v3.VAppBar(density="compact", flat=True, border=True):
             v3.VAppBarTitle("CranioNav")
+            draw_link()
             html.Div("Research software, not a medical device", classes="text-body-2 text-medium-emphasis mr-4")
             draw_help(procedure, self.panels)
 

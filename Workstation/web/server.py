@@ -17,18 +17,22 @@ def serve(port: int = 0, case: Path | None = None, open_browser: bool = True, ho
     """Serve the workstation until interrupted; loopback unless another interface is named, which then asks for a token."""
     os.environ.setdefault("WSLINK_READY_MSG", "")  # the first line on stdout is the address
     os.environ.setdefault("WSLINK_WS_COMPRESS", "0")  # pictures are compressed already
+    os.environ.setdefault("TRAME_WS_HEART_BEAT", "10")  # seconds; a dropped connection is noticed in half as much more
     from trame.app import get_server
 
     token = "" if host_name in LOOPBACK else secrets.token_urlsafe(16)
     server = get_server(client_type="vue3")
     _silence_vtk()
     from Workstation.web.application import WorkstationApp
+    from Workstation.web.session_link import ALIVE
 
     application = WorkstationApp(server, case)
 
     def bound(web: Any) -> None:
         web.app.middlewares.append(_gate(token))
         web.app.router.add_get("/session/{name}", _file_of(application))
+        web.app.router.add_get(f"/{ALIVE}", _alive_of(application.windows))
+        application.windows.guard(web)
 
     def ready(**_: Any) -> None:
         url = f"http://{host_name}:{server.port}/" + (f"?token={token}" if token else "")
@@ -83,6 +87,16 @@ def _gate(token: str) -> Any:
         return response
 
     return gate
+
+
+def _alive_of(windows: Any) -> Any:
+    """Answers a page that asks whether the server is there, whether it is still the same, and whether it knows the page."""
+    from aiohttp import web
+
+    async def answer(request: Any) -> Any:
+        return web.json_response({"boot": windows.boot, "open": windows.is_open(request.query.get("window", ""))})
+
+    return answer
 
 
 def _file_of(application: Any) -> Any:
