@@ -232,9 +232,7 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
     def suggestLandmarksBlocked(self):
         """Why no landmarks can be suggested now."""
-        if not self._lacking("LandmarksCT"):
-            return "the CT has landmarks already; remove them first"
-        return self._lacking("Bone", "OuterTable")
+        return self._lacking("Bone", "OuterTable") and "find the bone first"
 
     # Planned landmarks
 

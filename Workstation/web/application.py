@@ -9,7 +9,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from CranioNavLib import host
+from CranioNavLib import host, scene
 from CranioNavLib.errors import InputError
 from CranioNavLib.panel import Panel
 from CranioNavLib.panel_model import PanelModel
@@ -24,7 +24,10 @@ from Workstation.web.procedure import HAND, NAVIGATION, PROCEDURE, REGISTRATION,
 from Workstation.web.session_folder import SessionFolder, new_folder
 from Workstation.web.session_panel import SessionLogic
 from Workstation.web.session_windows import Windows
-from Workstation.web.views import ViewFollower, registered
+from Workstation.web.sounds import Cues, situation
+from Workstation.web.tool_models import registered
+from Workstation.web.view_controls import ViewControls, layout_grid
+from Workstation.web.views import ViewFollower
 
 POLL_S = 0.04  # devices: at least 20 updates a second reach the views
 REFRESH_EVERY = 5  # polls between two looks at the read-outs
@@ -55,7 +58,9 @@ class WorkstationApp(TrameApp):
             model = PanelModel(panel, logic, self.runner)
             self.panels[panel.module] = PanelView(self.server, model, key, self.session.shown, self.session.meant, self._poll)
         self._use_folder()
-        self.views = ViewFollower(self.slicer)
+        self.views, self.cues = ViewFollower(self.slicer), Cues()
+        self.controls = ViewControls(self.server, self.layouts, self.views.fit)
+        self.server.state.legend, self.server.state.cue, self.server.state.muted = None, {}, False
         self.server.state.live, self.server.state.files, self.server.state.simulated = (
             drawings(self.logics[ULTRASOUND]),
             [],
@@ -85,8 +90,8 @@ class WorkstationApp(TrameApp):
         register_quiet_factories(self.slicer.view_manager, self.server, PICTURE_QUALITY)
         self.layouts = LayoutManager(self.slicer.scene, self.slicer.view_manager, self.server)
         # the views are made here: made inside the page, their widgets would land between the page's own
-        self.layouts.register_layout_dict(LayoutManager.default_grid_configuration())
-        self.layouts.set_layout("Quad View")
+        self.layouts.register_layout_dict(layout_grid())
+        self.layouts.set_layout("four")
         self.budget = pace(self.slicer.view_manager.get_views())
 
     def _use_folder(self) -> None:
@@ -129,8 +134,8 @@ class WorkstationApp(TrameApp):
         if turn % 2 == 0 and self.server.state.step == "navigation":
             self._navigate()
         if turn % REFRESH_EVERY == 0:
-            self.views.refresh(self._forerun_mm())
             with self.server.state as state:
+                self._refresh_views(state)
                 if state.step in ("devices", "ultrasound"):
                     state.live = drawings(self.logics[ULTRASOUND])
                 state.files = self.logics[SESSION].offered()
@@ -140,6 +145,23 @@ class WorkstationApp(TrameApp):
         if turn % SAVE_EVERY == 0:
             self._save()
             self.windows.drop_stalled()
+
+    def _refresh_views(self, state: Any) -> None:
+        """Views, legend and sounds as the open step needs them."""
+        ultrasound = self.logics[ULTRASOUND]
+        state.legend = self.views.refresh(state.step, state.error_shown, self._forerun_mm(), self._asked_for(state.step))
+        cue = self.cues.next(situation(self.panels, ultrasound, state.step == "ultrasound"))
+        if cue is not None:
+            state.cue = cue
+
+    def _asked_for(self, step: str) -> str:
+        """The point that the open step asks for; "" if none."""
+        index, node = self.logics[ULTRASOUND].currentIndex(), scene.find("ProtocolPoints")
+        if step == "ultrasound":
+            return str(node.GetNthControlPointLabel(index)) if node is not None and index >= 0 else ""
+        if step == "landmarks":
+            return str(self.logics[TRACKING].nextPoint().text)
+        return str(self.logics[REGISTRATION].parameters().read().landmark) if step == "bone" else ""
 
     def _forerun_mm(self) -> float:
         """Of the probe that is connected, else 0."""

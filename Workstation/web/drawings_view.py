@@ -45,7 +45,7 @@ def draw_live(step: str) -> None:
     """The drawings that belong to a step of the procedure, in the current trame context."""
     if step not in ("devices", "ultrasound"):
         return
-    with html.Div(classes="mb-3", raw_attrs=['data-drawing="live"']):
+    with html.Div(classes="in-sight mb-3", raw_attrs=['data-drawing="live"']):
         if step == "ultrasound":
             html.Div(DOTS, v_if="live.points.length", classes="mb-3")
             with html.Div(v_if="live.eye", classes="d-flex align-center mb-2", style="gap: 12px"):

@@ -1,4 +1,4 @@
-"""The panels' shortcuts in the browser: a key presses the open step's button, as a click would; "?" lists them."""
+"""The keys in the browser: they press the open step's buttons, then the page's own, as a click would; "?" lists them."""
 
 from __future__ import annotations
 
@@ -8,29 +8,40 @@ from trame.widgets import vuetify3 as v3
 
 from Workstation.web.panel_view import PanelView
 from Workstation.web.procedure import HAND, ProcedureStep
+from Workstation.web.toolbar import KEYS
+from Workstation.web.view_controls import STEPS_MM
 
 # Text fields keep their keys; a button or slider reached by Tab keeps those that work it, one that was clicked does not.
+# Once: another layout draws the page anew, and with it this script.
 LISTEN = """
+if (!window.cranionavKeys) {
+window.cranionavKeys = true;
 window.addEventListener('click', (event) => {
   const button = event.detail && event.target.closest && event.target.closest('button, a');
   if (button) button.blur();
 }, true);
 window.addEventListener('keydown', (event) => {
   const at = event.target;
-  if (event.altKey || event.metaKey || event.repeat) return;
+  if (event.altKey || event.metaKey) return;
   if (at.closest && at.closest('input, textarea, select, [contenteditable], [role=slider], [role=listbox]')) return;
   if (event.key === '?') { document.querySelector('[data-keys]').click(); return; }
   if (document.querySelector('.v-overlay--active .v-card')) return;
-  const named = { ' ': 'Space', ArrowLeft: 'Left', ArrowRight: 'Right' }[event.key] || event.key;
+  const named = { ' ': 'Space', ArrowLeft: 'Left', ArrowRight: 'Right', Delete: 'Del' }[event.key] || event.key;
   const name = (event.ctrlKey ? 'Ctrl+' : '') + (named.length === 1 ? named.toUpperCase() : named);
   if (named === 'Space' && at.matches && at.matches('button:focus-visible, a:focus-visible, [tabindex]:focus-visible')) return;
+  const typed = event.key.length === 1 ? event.key.toUpperCase() : event.key;
+  const page = (event.ctrlKey ? 'Ctrl+' : event.shiftKey && typed.length > 1 ? 'Shift+' : '') + typed;
   const button = [...document.querySelectorAll('[data-shortcut]')].find(
     (one) => one.dataset.shortcut === name && one.getClientRects().length && !one.closest('[inert]'));
-  if (!button) return;
+  const target = button || [...document.querySelectorAll('[data-key]')].find(
+    (one) => one.dataset.key === page && !one.closest('[inert]'));
+  if (!target) return;
   event.preventDefault();
+  if (event.repeat && !target.dataset.repeats) return;
   if (document.activeElement) document.activeElement.blur();
-  if (!button.disabled) button.click();
+  if (!target.disabled) target.click();
 }, true);
+}
 """
 
 
@@ -51,10 +62,27 @@ def shortcuts(
 def draw_help(procedure: tuple[ProcedureStep, ...], panels: dict[str, PanelView]) -> None:
     """The button "?" of the title bar with its list, and the listener of the keys."""
     client.Script(LISTEN)
+    _draw_hidden(procedure)
     v3.VBtn("?", icon=True, size="small", click="keys = !keys", title="Keys (?)", raw_attrs=["data-keys"])
-    with v3.VDialog(v_model=("keys", False), max_width=560), v3.VCard(title="Keys"), v3.VCardText():
-        for key, what, step in (*shortcuts(procedure, panels), ("?", "Show or hide this list", "every step")):
+    everywhere = [(key, what, "every step") for key, what in (*KEYS, ("?", "Show or hide this list"))]
+    with v3.VDialog(v_model=("keys", False), max_width=760, scrollable=True), v3.VCard(title="Keys"), v3.VCardText():
+        for key, what, step in (*shortcuts(procedure, panels), *everywhere):
             with html.Div(classes="d-flex py-1", style="gap: 16px"):
-                html.Div(key, style="width: 80px", classes="font-weight-bold")
+                html.Div(key, style="width: 130px; flex: none", classes="font-weight-bold")
                 html.Div(what, classes="flex-grow-1")
-                html.Div(step, classes="text-medium-emphasis")
+                html.Div(step, classes="text-medium-emphasis text-no-wrap")
+
+
+def _draw_hidden(procedure: tuple[ProcedureStep, ...]) -> None:
+    """Buttons that only keys press."""
+    names = repr([step.name for step in procedure])
+    for key, way in (("N", 1), ("B", -1)):
+        onwards = f"step = {names}[Math.min({len(procedure) - 1}, Math.max(0, {names}.indexOf(step) + {way}))]"
+        html.Button(style="display: none", click=onwards, raw_attrs=[f'data-key="{key}"'])
+    for key in STEPS_MM:
+        for far, shift in ((False, ""), (True, "Shift+")):
+            html.Button(
+                style="display: none",
+                click=f"trigger('view_move', ['{key}', {str(far).lower()}])",
+                raw_attrs=[f'data-key="{shift}{key}"', 'data-repeats="yes"'],
+            )

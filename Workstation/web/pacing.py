@@ -7,9 +7,10 @@ import time
 from functools import partial
 from typing import Any
 
-from trame_slicer.app.ui import create_vertical_slice_view_gutter_ui, create_vertical_view_gutter_ui
 from trame_slicer.rca_view.rca_view_factory import RemoteViewFactory
 from trame_slicer.views import ScheduledRenderStrategy, SliceView, ThreeDView, ViewType
+
+from Workstation.web.view_frame import slice_frame, threed_frame
 
 FASTEST_S = 1 / 25  # between two pictures of one view
 SHARE = 0.4  # of the event loop's time, for the rendering of all views together
@@ -80,8 +81,8 @@ class PacedRendering(ScheduledRenderStrategy):
 def register_quiet_factories(view_manager: Any, server: Any, quality: int) -> None:
     """Views for the page that do not render while they are made, as nobody looks at them yet."""
     for kind, view_type, controls in (
-        (SliceView, ViewType.SLICE_VIEW, create_vertical_slice_view_gutter_ui),
-        (ThreeDView, ViewType.THREE_D_VIEW, create_vertical_view_gutter_ui),
+        (SliceView, ViewType.SLICE_VIEW, slice_frame),
+        (ThreeDView, ViewType.THREE_D_VIEW, threed_frame),
     ):
         quiet = partial(kind, scheduled_render_strategy=ScheduledRenderStrategy())
         view_manager.register_factory(

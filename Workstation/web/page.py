@@ -14,6 +14,9 @@ from Workstation.web.keyboard import draw_help
 from Workstation.web.panel_view import PanelView
 from Workstation.web.procedure import HAND, ProcedureStep
 from Workstation.web.session_link import draw_link
+from Workstation.web.sounds_view import draw_sounds
+from Workstation.web.toolbar import draw_toolbar
+from Workstation.web.view_frame import STYLE as FRAME_STYLE
 
 SIGN_OF = "({ 'to do': '○', 'done': '✓', 'needs attention': '!' })"
 COLOR_OF = "({ 'to do': undefined, 'done': '#2fbf8f', 'needs attention': '#f0b429' })"
@@ -25,6 +28,11 @@ html { overflow: hidden; }
 .step-sign { width: 26px; height: 26px; border-radius: 50%; border: 2px solid currentColor;
   text-align: center; line-height: 22px; font-weight: 700; }
 .in-sight { position: sticky; top: 0; z-index: 2; padding-top: 10px; background: rgb(var(--v-theme-surface)); }
+.buttons { display: flex; flex-wrap: wrap; gap: 8px; margin: 8px 0; }
+.buttons > div { flex: 1 1 40%; min-width: 0; }
+.buttons > .wide { flex-basis: 100%; }
+.buttons .v-btn { letter-spacing: 0; text-transform: none; font-size: 16px; padding: 0 8px; }
+.buttons .v-btn__content { white-space: normal; line-height: 1.15; }
 .part { border-top: 1px solid rgba(255, 255, 255, 0.12); padding-top: 12px; margin-top: 12px; }
 """
 
@@ -38,7 +46,7 @@ class Page:
         server.state.trame__title = "CranioNav"
         with VAppLayout(server) as self.layout:
             self.layout.root.theme = "dark"
-            client.Style(STYLE + DRAWINGS_STYLE)
+            client.Style(STYLE + DRAWINGS_STYLE + FRAME_STYLE)
             self._draw_title(procedure)
             self._draw_steps(procedure)
             self._draw_open_step(procedure)
@@ -50,6 +58,8 @@ class Page:
             v3.VAppBarTitle("CranioNav")
             draw_link()
             html.Div("Research software, not a medical device", classes="text-body-2 text-medium-emphasis mr-4")
+            draw_toolbar()
+            draw_sounds()
             draw_help(procedure, self.panels)
 
     def _draw_steps(self, procedure: tuple[ProcedureStep, ...]) -> None:
@@ -80,8 +90,7 @@ class Page:
                 with html.Div(v_show=f"step === '{step.name}'", classes="pa-4", raw_attrs=[f'data-panel="{step.name}"']):
                     html.Div(f"{number}  {step.title}", classes="text-h6 mb-2")
                     self._draw_what_next(step, after)
-                    with html.Div(classes="in-sight"):
-                        draw_live(step.name)
+                    draw_live(step.name)
                     for module, name in step.parts:
                         view = self.panels[module]
                         only_simulated = module == HAND and name != "patient"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import groupby
 from typing import Any
 
 from CranioNavLib.panel import (
@@ -68,9 +69,11 @@ class PanelView:
         """The widgets of one step, in the current trame context."""
         if step.help:
             html.Div(step.help, classes="text-body-2 text-medium-emphasis mb-3")
-        for item in step.items:
-            if not _is_setting(item):
-                self._draw_item(item)
+        shown = [item for item in step.items if not _is_setting(item)]
+        for are_buttons, items in groupby(shown, lambda item: isinstance(item, Action)):
+            with html.Div(classes="buttons" if are_buttons else ""):
+                for item in items:
+                    self._draw_item(item)
         settings = [item for item in step.items if _is_setting(item)]
         if settings:
             with (
@@ -108,7 +111,9 @@ class PanelView:
     def _draw_action(self, item: Action) -> None:
         key = f'data-shortcut="{item.shortcut}"' if item.shortcut else ""
         meant = f"{item.help} ({item.shortcut})" if item.shortcut else item.help
-        with html.Div(classes="my-2", title=(f"{self.key}.blocked['{item.name}'] || '{_quoted(meant)}'",)):
+        with html.Div(
+            classes="wide" if item.primary else "", title=(f"{self.key}.blocked['{item.name}'] || '{_quoted(meant)}'",)
+        ):
             v3.VBtn(
                 item.label,
                 block=True,
@@ -168,7 +173,8 @@ class PanelView:
                 active=(f"one.name === {self.key}.fields['{item.name}']",),
                 color="primary",
                 title=("(one.done ? '✓ ' : '○ ') + one.name",),
-                subtitle=("one.note",),
+                min_height=34,
+                subtitle=("one.note || undefined",),
                 click=f"trigger('{self.key}_pick', ['{item.name}', one.name])",
                 raw_attrs=[':data-entry="one.name"'],
             ),

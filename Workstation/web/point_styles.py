@@ -23,7 +23,7 @@ class PointStyle:
 
 
 STYLES = {
-    "LandmarksCT": PointStyle(5.0, "Sphere3D", ("ct", "bone", "devices", "calibration", "landmarks"), ("bone", "landmarks")),
+    "LandmarksCT": PointStyle(5.0, "Sphere3D", ("ct", "bone", "devices", "calibration", "landmarks")),
     "LandmarksPatient": PointStyle(6.0, "ThickCross2D", ("landmarks",)),
     "TargetsCT": PointStyle(4.0, "Diamond2D", ("bone", *LATER), ("navigation",)),
     "TargetsPatient": PointStyle(4.0, "ThickCross2D", ("verification",)),
@@ -32,7 +32,8 @@ STYLES = {
     "RegisteredPoints": PointStyle(3.5, "Sphere3D", ("ultrasound", "verification")),
     "PlausibilityPoints": PointStyle(4.0, "Square2D", ("verification",)),
 }
-ASKED_FOR = (1.0, 0.85, 0.2)  # the planned point to palpate now
+ASKED_FOR = (1.0, 0.85, 0.2)  # the point to place, touch or palpate now
+MARKED = ("LandmarksCT", "ProtocolPoints")  # lists of which one point is asked for
 
 
 class PointStyles:
@@ -41,8 +42,8 @@ class PointStyles:
     def __init__(self) -> None:
         self._styled: set[str] = set()
 
-    def refresh(self, step: str, residuals_drawn: bool, asked_for: int) -> None:
-        """For the open step; `asked_for` is the index of the planned point to palpate now, or -1."""
+    def refresh(self, step: str, residuals_drawn: bool, asked_for: str) -> None:
+        """For the open step; `asked_for` names the point to place, touch or palpate now, or is empty."""
         for role, style in STYLES.items():
             node = scene.find(role)
             if node is None or node.GetDisplayNode() is None:
@@ -54,7 +55,8 @@ class PointStyles:
             _set(node.GetDisplayNode(), "Visibility", step in style.steps and known and not _replaced(role, residuals_drawn))
             _set(node.GetDisplayNode(), "PointLabelsVisibility", step in style.named_in)
             _set(node, "Locked", not (role == "LandmarksCT" and step == "bone"))  # dragged only where they are planned
-        _mark(scene.find("ProtocolPoints"), asked_for)
+            if role in MARKED:
+                _mark(node, asked_for)
 
 
 def _replaced(role: str, residuals_drawn: bool) -> bool:
@@ -71,16 +73,15 @@ def _style(node: Any, style: PointStyle) -> None:
     display.SetGlyphType(getattr(display, style.glyph))
     display.SetTextScale(4.0)
     display.SetPropertiesLabelVisibility(False)
-    if node.GetAttribute(scene.ROLE_ATTRIBUTE) == "ProtocolPoints":
+    if node.GetAttribute(scene.ROLE_ATTRIBUTE) in MARKED:
         display.SetSelectedColor(*ASKED_FOR)  # selected is the one asked for
 
 
-def _mark(node: Any, asked_for: int) -> None:
-    if node is None:
-        return
+def _mark(node: Any, asked_for: str) -> None:
     for index in range(node.GetNumberOfControlPoints()):
-        if node.GetNthControlPointSelected(index) != (index == asked_for):
-            node.SetNthControlPointSelected(index, index == asked_for)
+        wanted = node.GetNthControlPointLabel(index) == asked_for
+        if node.GetNthControlPointSelected(index) != wanted:
+            node.SetNthControlPointSelected(index, wanted)
 
 
 def _set(node: Any, name: str, value: bool) -> None:

@@ -7,6 +7,8 @@ from trame.widgets import client, html
 # [frequency in Hz, start in s, length in s] of each tone of a cue
 PLAY = """
 (() => {
+  if (window.cranionavSounds) return;  // another layout draws the page anew, and with it this script
+  window.cranionavSounds = true;
   const TONES = {
     taken: [[880, 0, 0.09], [1320, 0.1, 0.14]],
     refused: [[196, 0, 0.18], [156, 0.2, 0.28]],
@@ -33,19 +35,16 @@ PLAY = """
       tone.stop(begin + length + 0.02);
     }
   };
-  const listen = () => {
+  let heard = null;
+  setInterval(() => {
     const cue = document.querySelector('[data-cue]');
-    if (!cue) { setTimeout(listen, 200); return; }
-    let heard = cue.dataset.count;
-    new MutationObserver(() => {
-      if (cue.dataset.count === heard) return;
-      heard = cue.dataset.count;
-      if (cue.dataset.muted === 'true') return;
-      cue.dataset.played = cue.dataset.name;
-      play(cue.dataset.name, Number(cue.dataset.pitch));
-    }).observe(cue, { attributes: true });
-  };
-  listen();
+    if (!cue || cue.dataset.count === heard) return;
+    const first = heard === null;
+    heard = cue.dataset.count;
+    if (first || cue.dataset.muted === 'true') return;
+    cue.dataset.played = cue.dataset.name;
+    play(cue.dataset.name, Number(cue.dataset.pitch));
+  }, 50);
 })();
 """
 

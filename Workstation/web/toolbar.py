@@ -37,7 +37,7 @@ def draw_toolbar() -> None:
                 icon=choice.icon,
                 value=name,
                 title=f"{choice.title} ({choice.key})",
-                size="small",
+                width=34,
                 raw_attrs=[f'data-key="{choice.key}"'],
             )
     with v3.VBtnToggle(
