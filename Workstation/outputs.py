@@ -84,6 +84,9 @@ def print_result(records: Sequence[Mapping[str, Any]], folder: Path) -> None:
     for record in records:
         for message in record["messages"]:
             print(f"{record['case']}: {message}")
+    if len(records) == 1 and records[0]["verification"]:
+        for sentence in records[0]["verification"]["summary"]:
+            print(sentence)
     print(f"files: {folder}")
 
 

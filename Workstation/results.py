@@ -15,6 +15,7 @@ from CranioNavLib.files import write_text, written_whole
 
 if TYPE_CHECKING:
     from ModuleRegistrationLib.procedure import CaseResult
+    from ModuleRegistrationLib.verification.held_out import DistanceCheck
 
 SUMMARY_COLUMNS = (
     "case,mode,method,status,fre_mm,surface_rms_mm,tre_mean_mm,tre_max_mm,"
@@ -23,7 +24,7 @@ SUMMARY_COLUMNS = (
 
 RECORD_KEYS = (
     "case mode method status messages reference_to_ras fre_mm surface_rms_mm iterations points_used points_rejected "
-    "speed_of_sound_m_s predicted_tre_mm predicted_tre_p95_mm tre_mm tre_mean_mm tre_max_mm duration_s versions"
+    "speed_of_sound_m_s predicted_tre_mm predicted_tre_p95_mm tre_mm tre_mean_mm tre_max_mm duration_s versions verification"
 ).split()
 
 VERSIONED = ("numpy", "scipy", "SimpleITK", "vtk", "open3d-cpu", "open3d", "slicer-core")
@@ -64,8 +65,55 @@ def registration_record(result: CaseResult) -> dict[str, Any]:
         "tre_max_mm": tre.max_mm if tre else None,
         "duration_s": result.duration_s,
         "versions": versions(),
+        "verification": verification_record(result),
     }
     return {key: _known(value) for key, value in record.items()}
+
+
+def verification_record(result: CaseResult) -> dict[str, Any]:
+    """What the registration says of itself beyond the predicted TRE, and what points it has not used say of it."""
+    registration, confidence = result.registration, result.confidence
+    below, left_out = confidence.below_limit, confidence.left_out
+    return {
+        "summary": confidence.sentences(),
+        "limit_mm": confidence.limit_mm,
+        "targets_ras_mm": result.targets_ras_mm.tolist(),
+        "probability_below_limit": None if below is None else below.tolist(),
+        "held_out": _check_record(confidence.held_out),
+        "plausibility": _check_record(confidence.touched),
+        "leave_one_out": None
+        if left_out is None
+        else {
+            "labels": list(left_out.labels),
+            "residuals_mm": left_out.residuals_mm.tolist(),
+            "expected_sd_mm": left_out.expected_sd_mm.tolist(),
+            "target_shift_mm": left_out.shifts_mm.tolist(),
+            "most_influential": left_out.labels[left_out.most_influential],
+        },
+        # of a small motion: rotation (rad) about the pivot, then translation (mm), RAS axes
+        "covariance": None if registration.covariance is None else registration.covariance.tolist(),
+        "pivot_ras_mm": registration.pivot_ras_mm.tolist(),
+        "degrees_of_freedom": registration.degrees_of_freedom,
+        "bone_surface": {
+            "threshold_hu": result.bone.threshold_hu,
+            "position_sd_mm": result.bone.position_sd_mm,
+            "offset_sd_mm": result.bone.offset_sd_mm,
+        },
+    }
+
+
+def _check_record(check: DistanceCheck | None) -> dict[str, Any] | None:
+    if check is None:
+        return None
+    return {
+        "labels": list(check.labels),
+        "distances_mm": check.distances_mm.tolist(),
+        "expected_sd_mm": check.expected_sd_mm.tolist(),
+        "chi_square": check.chi_square,
+        "degrees_of_freedom": check.degrees_of_freedom,
+        "p_value": check.p_value,
+        "as_expected": check.as_expected,
+    }
 
 
 def _known(value: Any) -> Any:

@@ -6,7 +6,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Optional
 
 import numpy as np
@@ -25,7 +25,8 @@ from ModuleRegistrationLib.registration.error_theory import PredictedTre, predic
 from ModuleRegistrationLib.registration.landmarks import LandmarkRegistration, register_landmarks
 from ModuleRegistrationLib.registration.pairing import pair_points
 from ModuleRegistrationLib.registration.problem import METHODS, RegistrationProblem, RegistrationResult
-from ModuleRegistrationLib.registration.verdict import Limits, Verdict, judge
+from ModuleRegistrationLib.registration.verdict import ACCEPTED, WARNING, Limits, Verdict, judge
+from ModuleRegistrationLib.verification.confidence import LIMIT_MM, Confidence, assess, touched_points
 from ModuleRegistrationLib.verification.plausibility import Plausibility, plausibility
 from ModuleRegistrationLib.verification.tre import TargetErrors, target_errors
 
@@ -41,6 +42,7 @@ USUAL_FLE_MM = {"Ia": 0.7, "Ib": 2.0, "IIa": 3.5, "IIb": 3.5, "III": 3.5}
 # Landmarks alone are a start, not a result to navigate by: their error is told in a warning, and refused only beyond use
 LANDMARKS_ALONE = Limits(refuse_p95_mm=20.0)
 DEFAULT_TARGETS = 12  # spread over the outer table, where a case names no targets
+CONTRADICTED_P = 1e-3  # plausibility points as far off as these make an accepted registration a doubtful one
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +72,7 @@ class CaseResult:
     ultrasound: Optional[Ultrasound] = None
     tre: Optional[TargetErrors] = None
     plausibility: Optional[Plausibility] = None
+    confidence: Confidence = field(default_factory=lambda: Confidence(LIMIT_MM))
     duration_s: float = 0.0
     target_labels: tuple[str, ...] = field(default_factory=tuple)
 
@@ -80,8 +83,18 @@ def register_case(
     method: Optional[str] = None,
     segmentation: str = "threshold",
     progress: Optional[Progress] = None,
+    limit_mm: float = LIMIT_MM,
 ) -> CaseResult:
     """Read, segment, register, judge and verify one case.
+
+    Parameters
+    ----------
+    case : Case
+    mode, method, segmentation : str, optional
+        By default the richest mode the case allows, `cranionav` (`procrustes` in landmark modes), and `threshold`.
+    progress : callable, optional
+    limit_mm : float
+        The error at a target that the probability of staying below is told for.
 
     Raises
     ------
@@ -102,21 +115,17 @@ def register_case(
     say("measuring bone points", 0.55)
     points, ultrasound = collect_points(case, mode)
     say(f"registering with {method}", 0.75)
-    problem = RegistrationProblem(
-        surface=bone.outer_table,
-        points=points,
-        initial_reference_to_ras=landmarks.reference_to_ras,
-        landmarks_ct_mm=planned,
-        landmarks_patient_mm=patient,
-        # with bone points the method estimates the landmarks' error itself
-        landmark_sd_mm=USUAL_FLE_MM[mode] / math.sqrt(3) if mode in LANDMARK_MODES else None,
-        surface_sd_mm=bone.position_sd_mm,
-        surface_offset_sd_mm=bone.offset_sd_mm,
-    )
-    registration = METHODS.create(method).register(problem)
-    say("verifying", 0.9)
+    problem = _problem(mode, bone, points, landmarks, planned, patient)
+    plugin = METHODS.create(method)
+    registration = plugin.register(problem)
+    say("verifying", 0.85)
     targets, target_labels = _targets(case, bone)
     predicted = predict_tre_of(registration, targets) if registration.covariance is not None else None
+    confidence = assess(problem, registration, targets, plugin, limit_mm)
+    checks = _plausibility(case, registration, bone)
+    if checks is not None and case.plausibility is not None:
+        touched = touched_points(problem, registration, checks, case.plausibility.labels, STYLUS_POINT_SD_MM)
+        confidence = replace(confidence, touched=touched)
     verdict = judge(problem, registration, targets, LANDMARKS_ALONE if mode in LANDMARK_MODES else None)
     return CaseResult(
         case=case,
@@ -128,15 +137,41 @@ def register_case(
         landmarks_patient_mm=patient,
         points=points,
         registration=registration,
-        verdict=verdict,
+        verdict=_in_view_of(verdict, confidence),
         targets_ras_mm=targets,
         predicted=predicted,
         ultrasound=ultrasound,
         tre=_measured_tre(case, registration),
-        plausibility=_plausibility(case, registration, bone),
+        plausibility=checks,
+        confidence=confidence,
         duration_s=time.monotonic() - started,
         target_labels=target_labels,
     )
+
+
+def _problem(
+    mode: str, bone: BoneSurfaces, points: BonePoints, landmarks: LandmarkRegistration, planned: Array, patient: Array
+) -> RegistrationProblem:
+    return RegistrationProblem(
+        surface=bone.outer_table,
+        points=points,
+        initial_reference_to_ras=landmarks.reference_to_ras,
+        landmarks_ct_mm=planned,
+        landmarks_patient_mm=patient,
+        # with bone points the method estimates the landmarks' error itself
+        landmark_sd_mm=USUAL_FLE_MM[mode] / math.sqrt(3) if mode in LANDMARK_MODES else None,
+        surface_sd_mm=bone.position_sd_mm,
+        surface_offset_sd_mm=bone.offset_sd_mm,
+    )
+
+
+def _in_view_of(verdict: Verdict, confidence: Confidence) -> Verdict:
+    """The verdict, doubted where plausibility points contradict it."""
+    touched = confidence.touched
+    if touched is None or touched.p_value >= CONTRADICTED_P:
+        return verdict
+    status = WARNING if verdict.status == ACCEPTED else verdict.status
+    return replace(verdict, status=status, messages=(*verdict.messages, touched.words("the plausibility points")))
 
 
 def collect_points(case: Case, mode: str) -> tuple[BonePoints, Optional[Ultrasound]]:

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.xdist_group("simulated case")
 KEYS = {
     "case", "mode", "method", "status", "messages", "reference_to_ras", "fre_mm", "surface_rms_mm", "iterations",
     "points_used", "points_rejected", "speed_of_sound_m_s", "predicted_tre_mm", "predicted_tre_p95_mm", "tre_mm",
-    "tre_mean_mm", "tre_max_mm", "duration_s", "versions",
+    "tre_mean_mm", "tre_max_mm", "duration_s", "versions", "verification",
 }  # fmt: skip
 
 

@@ -14,6 +14,7 @@ def register(
     method: Annotated[Optional[str], typer.Option(help="registration plugin; see `cranionav plugins`")] = None,
     mode: Annotated[Optional[str], typer.Option(help="Ia, Ib, IIa, IIb or III; default: the richest the case allows")] = None,
     segmentation: Annotated[str, typer.Option(help="segmentation plugin")] = "threshold",
+    limit: Annotated[float, typer.Option(metavar="MM", min=0.1, help="tell the probability that the error is below this")] = 2.0,
     load: Annotated[Optional[list[Path]], typer.Option(metavar="FILE", help="a Python file that registers plugins")] = None,
     json: Annotated[bool, typer.Option("--json", help="print registration.json on stdout")] = False,
 ) -> int:
@@ -33,7 +34,9 @@ def register(
         load_file(file)
     folder = output_folder(output)
     with progress_bar() as say:
-        result = register_case(read_case(case), mode, method, segmentation, progress=lambda step, share: say(step, 0.7 * share))
+        result = register_case(
+            read_case(case), mode, method, segmentation, progress=lambda step, share: say(step, 0.7 * share), limit_mm=limit
+        )
         record = write_outputs(result, folder, progress=lambda step, share: say(step, 0.7 + 0.3 * share))
     if json:
         print_json(record)

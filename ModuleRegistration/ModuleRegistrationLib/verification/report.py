@@ -96,6 +96,7 @@ def _target_rows(result: CaseResult) -> list[dict[str, Any]]:
             "measured": result.tre.errors_mm[index] if result.tre else None,
             "mean": result.predicted.mean_mm[index] if result.predicted else None,
             "p95": result.predicted.p95_mm[index] if result.predicted else None,
+            "below": None if result.confidence.below_limit is None else 100 * result.confidence.below_limit[index],
         }
         for index in range(count)
     ]
@@ -104,6 +105,9 @@ def _target_rows(result: CaseResult) -> list[dict[str, Any]]:
 def _point_rows(result: CaseResult) -> list[dict[str, Any]]:
     points, registration = result.points, result.registration
     deviations = np.sqrt(np.trace(points.covariances_mm2, axis1=1, axis2=2)) if len(points) else np.empty(0)
+    held_out, left_out = result.confidence.held_out, result.confidence.left_out
+    distances = {} if held_out is None else dict(zip(held_out.labels, zip(held_out.distances_mm, held_out.expected_sd_mm)))
+    shifts = {} if left_out is None else dict(zip(left_out.labels, left_out.shifts_mm))
     return [
         {
             "label": points.labels[index],
@@ -112,6 +116,9 @@ def _point_rows(result: CaseResult) -> list[dict[str, Any]]:
             "depth": points.depths_mm[index] if points.has_beam[index] else None,
             "quality": points.qualities[index],
             "sd": deviations[index],
+            "held_out": distances.get(points.labels[index], (None, None))[0],
+            "expected": distances.get(points.labels[index], (None, None))[1],
+            "shift": shifts.get(points.labels[index]),
         }
         for index in range(len(points))
     ]
@@ -120,9 +127,11 @@ def _point_rows(result: CaseResult) -> list[dict[str, Any]]:
 def _plausibility_rows(result: CaseResult) -> list[dict[str, Any]]:
     if result.plausibility is None or result.case.plausibility is None:
         return []
+    touched, count = result.confidence.touched, len(result.plausibility.distances_mm)
+    expected = [None] * count if touched is None else touched.expected_sd_mm
     return [
-        {"label": label, "distance": distance}
-        for label, distance in zip(result.case.plausibility.labels, result.plausibility.distances_mm)
+        {"label": label, "distance": distance, "expected": sd}
+        for label, distance, sd in zip(result.case.plausibility.labels, result.plausibility.distances_mm, expected)
     ]
 
 
