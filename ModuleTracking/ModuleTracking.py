@@ -27,6 +27,7 @@ from ModuleTrackingLib.panel_description import PANEL, PointList, Tool, Tracking
 from ModuleTrackingLib.tracker import PoseStatus, TrackerError  # noqa: E402
 
 POLL_MS = 5
+MOST_SHOWN = 300  # poses of a pivoting tool that its drawing is made of
 TIP_HISTORY = 4096  # tip positions kept a tool: half a minute at 120 Hz
 LEVELS = {PoseStatus.OK: Level.GOOD, PoseStatus.OUT_OF_VOLUME: Level.WARNING}
 
@@ -315,13 +316,39 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
             return Reading(self._failure, Level.BAD)
         return Reading(f"{len(self._pivot[2])} poses") if self._pivot is not None else None
 
+    def pivotAdvice(self):
+        """To which side the tool has to be tilted further, while it is being pivoted."""
+        found = self._tiltCoverage()
+        if found is None:
+            return None
+        return Reading(found.advice or "every side is covered", Level.WARNING if found.advice else Level.GOOD)
+
+    def pivotCone(self):
+        """A drawing of the sides to which the tool has been tilted; None while it is not being pivoted."""
+        from ModuleTrackingLib.calibration.coverage import draw_coverage
+
+        found = self._tiltCoverage()
+        return draw_coverage(found) if found is not None else None
+
+    def _tiltCoverage(self):
+        import numpy as np
+        from CranioNavLib.rigid import invert_rigid
+        from ModuleTrackingLib.calibration.coverage import tilt_coverage
+
+        if self._pivot is None:
+            return None
+        camera = np.zeros(3)
+        if scene.find("ReferenceToTracker") is not None:
+            camera = invert_rigid(scene_data.get_transform("ReferenceToTracker"))[:3, 3]
+        poses = self._pivot[2]
+        return tilt_coverage(poses[:: -(1 + len(poses) // MOST_SHOWN)][::-1], camera) if poses else None  # the last stays
+
     def calibration(self):
         """The calibration of the chosen tool."""
         found = self._calibrated.get(self.parameters().read().tool.value)
         if found is None:
             return None
-        tip = ", ".join(f"{value:.2f}" for value in found.tip_in_marker_mm)
-        return Reading(f"({tip}) mm in the marker's frame, SD {found.tip_sd_mm:.2f} mm (worst direction)", Level.GOOD)
+        return Reading(f"found, SD {found.tip_sd_mm:.2f} mm in the worst direction", Level.GOOD)
 
     def nextPoint(self):
         """The label that the next point gets."""

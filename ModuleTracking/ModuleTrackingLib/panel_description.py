@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Annotated
 
-from CranioNavLib.panel import Action, FileField, NodeField, Panel, ParameterField, PluginField, ReadOut, Step
+from CranioNavLib.panel import Action, FileField, NodeField, Panel, ParameterField, Picture, PluginField, ReadOut, Step
 from CranioNavLib.parameters import Limits, Parameters
 
 from ModuleTrackingLib.tracker import TRACKERS
@@ -72,6 +72,8 @@ PANEL = Panel(
                 Action("startPivot", "Pivot", "Begin to collect poses; the calibration follows by itself", primary=True),
                 Action("cancelPivot", "Cancel", "Forget the poses collected"),
                 ReadOut("pivotProgress", "Pivot"),
+                ReadOut("pivotAdvice", "Do now", large=True),
+                Picture("pivotCone", "Sides to which the tool was tilted, seen from above it"),
                 ReadOut("calibration", "Tip"),
             ),
             status="calibrationStatus",

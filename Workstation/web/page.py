@@ -31,7 +31,8 @@ html { overflow: hidden; }
 .buttons { display: flex; flex-wrap: wrap; gap: 8px; margin: 8px 0; }
 .buttons > div { flex: 1 1 40%; min-width: 0; }
 .buttons > .wide { flex-basis: 100%; }
-.buttons .v-btn { letter-spacing: 0; text-transform: none; font-size: 16px; padding: 0 8px; }
+.buttons .v-btn { letter-spacing: 0; text-transform: none; font-size: 16px; height: auto; min-height: 38px;
+  padding: 6px 8px; }
 .buttons .v-btn__content { white-space: normal; line-height: 1.15; }
 .part { border-top: 1px solid rgba(255, 255, 255, 0.12); padding-top: 12px; margin-top: 12px; }
 """
