@@ -132,7 +132,7 @@ def listen(tracker: Tracker, seconds: float, timeout_s: float) -> dict[str, Any]
         while time.monotonic() - begin < seconds:
             tally.add(stream.poll())
             redraw()
-            time.sleep(TURN_S)
+            stream.wait(TURN_S)
         state = stream.state
         if not tally.frames:
             raise InputError(
@@ -187,7 +187,7 @@ def record_session(
             if not frames and getattr(tracker, "finished", False):  # a replay at its end
                 break
             if device is None:
-                time.sleep(TURN_S)
+                stream.wait(TURN_S)
         duration_s = time.monotonic() - begin
         state = stream.state
         if recorder is not None:

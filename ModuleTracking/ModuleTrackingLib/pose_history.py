@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import bisect
+import math
 from dataclasses import replace
 
 import numpy as np
-from CranioNavLib.rigid import Array, rigid
+from CranioNavLib.rigid import Array
 from scipy.spatial.transform import Rotation
 
 from ModuleTrackingLib.tracker import PoseStatus, ToolPose
@@ -94,7 +95,18 @@ class PoseHistory:
 
 def interpolate(a: Array, b: Array, share: float) -> Array:
     """The rigid transform at `share` (0: a, 1: b) of the way: rotation at constant speed about one axis, origin on a line."""
-    start = Rotation.from_matrix(a[:3, :3])
-    turn = (start.inv() * Rotation.from_matrix(b[:3, :3])).as_rotvec()
-    rotation = (start * Rotation.from_rotvec(share * turn)).as_matrix()
-    return rigid(rotation, (1 - share) * a[:3, 3] + share * b[:3, 3])
+    turn = a[:3, :3].T @ b[:3, :3]
+    sines = np.array((turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])) / 2  # axis times sin(angle)
+    sine, cosine = math.sqrt(float(sines @ sines)), (float(turn.trace()) - 1) / 2
+    if cosine < 0.5:  # far apart: rare, and the axis needs more care
+        start = Rotation.from_matrix(a[:3, :3])
+        rotation = (start * Rotation.from_rotvec(share * Rotation.from_matrix(turn).as_rotvec())).as_matrix()
+    else:
+        part = share * math.atan2(sine, cosine)
+        x, y, z = sines / max(sine, 1e-300)
+        across = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+        rotation = a[:3, :3] @ (np.eye(3) + math.sin(part) * across + (1 - math.cos(part)) * (across @ across))
+    between = np.eye(4)
+    between[:3, :3] = rotation
+    between[:3, 3] = (1 - share) * a[:3, 3] + share * b[:3, 3]
+    return between

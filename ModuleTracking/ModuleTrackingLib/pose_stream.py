@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -82,8 +83,13 @@ class PoseStream(DeviceStream):
         self._histories: dict[str, PoseHistory] = {}
         self._arrivals: deque[float] = deque()
         self._frames = self._dropped = self._reconnections = 0
+        self._news = threading.Event()
 
     # -- the main thread's side -------------------------------------------------------------------------------------
+
+    def wait(self, timeout_s: float) -> bool:
+        """Sleep until there is something for `poll` to take over, at most so long; whether there is."""
+        return self._news.wait(timeout_s)
 
     def poll(self) -> list[list[ToolPose]]:
         """Take over what came since the last call: the frames in order, each a pose of every tool.
@@ -100,6 +106,7 @@ class PoseStream(DeviceStream):
         with self._lock:
             events = list(self._queue)
             self._queue.clear()
+            self._news.clear()
         frames: list[list[ToolPose]] = []
         for event in events:
             if event.error is not None:
@@ -191,7 +198,9 @@ class PoseStream(DeviceStream):
             matrix = pose.tool_to_tracker
             if matrix is not None and pose.tool in self.calibrations:
                 matrix = matrix @ self.calibrations[pose.tool]
-            taken = replace(pose, tool_to_tracker=matrix, host_time_s=time_s)
+            taken = ToolPose(
+                pose.tool, matrix, pose.status, time_s, pose.device_time_s, pose.frame_number, pose.error_mm, pose.flags
+            )
             self._histories.setdefault(pose.tool, PoseHistory(pose.tool, self.largest_gap_s)).add(taken)
             frame.append(taken)
         return frame
@@ -212,6 +221,7 @@ class PoseStream(DeviceStream):
                     del self._queue[oldest]
                     self._dropped += 1
             self._queue.append(event)
+            self._news.set()
 
     def _opened(self, again: bool) -> None:
         self.tools = list(self.tracker.tools)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from abc import ABC, abstractmethod
 from types import TracebackType
@@ -12,6 +13,7 @@ from CranioNavLib.errors import InputError
 
 READ_S = 0.1
 RETRY_S = 0.5  # a device that returns is found again well within 2 s
+SWITCH_S = 0.001  # Python lets a busy thread go on for 5 ms otherwise: at 250 Hz a frame is gone after 4
 
 S = TypeVar("S", bound="DeviceStream")
 
@@ -40,6 +42,7 @@ class DeviceStream(ABC):
         if self._thread is None:
             self._stopping.clear()
             self._problem = "connecting"
+            sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_S))
             self._thread = threading.Thread(target=self._run, name=self._thread_name, daemon=True)
             self._thread.start()
 

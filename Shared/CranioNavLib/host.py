@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -66,6 +67,9 @@ def slicer_package() -> Any:
     InputError
         Neither is installed.
     """
+    loaded = sys.modules.get("slicer")  # asked for at every pose
+    if loaded is not None:
+        return loaded
     try:
         return importlib.import_module("slicer")
     except ImportError as error:
@@ -74,7 +78,8 @@ def slicer_package() -> Any:
 
 def in_application() -> bool:
     """Whether this is the Python of a running 3D Slicer application."""
-    return importlib.util.find_spec("slicer") is not None and hasattr(slicer_package(), "app")
+    loaded = "slicer" in sys.modules or importlib.util.find_spec("slicer") is not None
+    return loaded and hasattr(slicer_package(), "app")
 
 
 def scene() -> Any:

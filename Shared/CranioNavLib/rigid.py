@@ -76,14 +76,18 @@ def check_rigid(matrix: npt.ArrayLike, name: str = "transform") -> Array:
 
 def _is_exactly_rigid(matrix: Array) -> bool:
     """Whether a 4x4 is rigid to rounding; False, too, for values that are not finite."""
-    if matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
-        return False
-    a, b, c = matrix[:3, :3].tolist()
-    det = a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])
-    squares = [sum(x * y for x, y in zip(one, other)) for one, other in ((a, a), (b, b), (c, c), (a, b), (a, c), (b, c))]
-    off = max(abs(value - wanted) for value, wanted in zip(squares, (1, 1, 1, 0, 0, 0)))
-    finite = all(map(math.isfinite, (*matrix[:3, 3].tolist(), *a, *b, *c)))
-    return bool(det > 0 and off < 1e-12 and finite)
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), last = matrix.tolist()
+    return (
+        last == [0.0, 0.0, 0.0, 1.0]
+        and math.isfinite(x + y + z)
+        and abs(a * a + b * b + c * c - 1) < 1e-12
+        and abs(d * d + e * e + f * f - 1) < 1e-12
+        and abs(g * g + h * h + i * i - 1) < 1e-12
+        and abs(a * d + b * e + c * f) < 1e-12
+        and abs(a * g + b * h + c * i) < 1e-12
+        and abs(d * g + e * h + f * i) < 1e-12
+        and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0
+    )
 
 
 def rigid(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Array:
@@ -106,6 +110,12 @@ def rigid_from_vector(rotation_vector: npt.ArrayLike, translation: npt.ArrayLike
 def invert_rigid(matrix: npt.ArrayLike) -> Array:
     """Inverse of rigid transform(s), shape (..., 4, 4)."""
     matrix = np.asarray(matrix, dtype=float)
+    if matrix.shape == (4, 4):  # poses come hundreds of times a second
+        inverse = np.zeros((4, 4))
+        inverse[:3, :3] = matrix[:3, :3].T
+        inverse[:3, 3] = -inverse[:3, :3] @ matrix[:3, 3]
+        inverse[3, 3] = 1.0
+        return inverse
     transposed = np.swapaxes(matrix[..., :3, :3], -1, -2)
     return rigid(transposed, -np.einsum("...ij,...j->...i", transposed, matrix[..., :3, 3]))
 

@@ -80,6 +80,9 @@ ROLES: dict[str, Role] = {
 }
 
 
+_transforms: dict[str, Any] = {}  # found before: they are asked for at every pose
+
+
 def role(name: str) -> Role:
     """The role of that name.
 
@@ -95,10 +98,16 @@ def role(name: str) -> Role:
 
 def find(name: str) -> Any | None:
     """The node that plays a role, or None. Of several (a cloned node keeps its role) the first in the scene."""
-    mrml_class, scene = role(name).mrml_class, host.scene()
+    scene = host.scene()
+    known = _transforms.get(name)
+    if known is not None and known.GetScene() is scene and known.GetAttribute(ROLE_ATTRIBUTE) == name:
+        return known
+    mrml_class = role(name).mrml_class
     for index in range(scene.GetNumberOfNodesByClass(mrml_class)):
         node = scene.GetNthNodeByClass(index, mrml_class)
         if node.GetAttribute(ROLE_ATTRIBUTE) == name:
+            if ROLES[name].node_class == _MOVE:
+                _transforms[name] = node
             return node
     return None
 

@@ -63,9 +63,12 @@ def get_points(role: str) -> LabelledPoints:
 
 def set_transform(role: str, matrix: npt.ArrayLike) -> Any:
     """Set the rigid ToParent matrix (4, 4) of a role's transform; returns the node."""
+    from vtkmodules.vtkCommonMath import vtkMatrix4x4
+
     host.check_thread()
-    node = scene.find_or_create(role)
-    node.SetMatrixTransformToParent(host.slicer_package().util.vtkMatrixFromArray(check_rigid(matrix, role)))
+    node, to_parent = scene.find_or_create(role), vtkMatrix4x4()
+    to_parent.DeepCopy(check_rigid(matrix, role).ravel().tolist())
+    node.SetMatrixTransformToParent(to_parent)
     return node
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -26,8 +28,8 @@ FAILURES_FOR_LOSS = 3
 LOST_AFTER_S = 0.5  # nothing but failures for this long, and at least three of them
 LONGEST_SILENCE_S = 2.0  # without a frame from a device that otherwise answers
 WRAP = 2**32
-FRAMES_TO_LEARN, KEPT_FRAMES = 16, 60  # for the pace of frames
-LARGEST_LEAD = 0.95  # of the period: without any rest, where the line is the limit
+FRAMES_TO_LEARN, KEPT_FRAMES = 16, 300  # for the pace of frames
+LATER, MUCH_SOONER = 0.03, 0.1  # of the period: how the time of the next poll is moved, see FrameClock
 FENCE_S = 0.2
 LINE_SHARE = 0.75  # of a frame's time that replies may fill
 NO_TOOL_S = 0.02  # pace of polling while every handle is disabled or unplugged
@@ -35,13 +37,17 @@ BYTES_A_TOOL = {True: 53, False: 94}  # BX, TX, with tool information
 
 
 class FrameClock:
-    """Frame numbers as a count that never wraps, and the pace at which frames come."""
+    """Frame numbers as a count that never wraps, and the time at which the next frame can be had.
+
+    A device keeps only its newest frame: asked too early it repeats the last one, asked too late one is lost. So polls keep
+    to the device's own pace, as soon after each frame as can be: a little sooner every time, and later when it was too soon.
+    """
 
     def __init__(self) -> None:
         self.count = -1  # of the newest frame, unwrapped
-        self._recent: list[tuple[int, float]] = []  # frames: count, host time of asking
-        self._step = 0  # smallest difference of frame numbers
-        self._lead = 0.25  # how much before the next frame is due the poll goes out, as a share of the period
+        self._recent: deque[tuple[int, float]] = deque(maxlen=KEPT_FRAMES)  # frames: count, host time of asking
+        self._steps: deque[int] = deque(maxlen=FRAMES_TO_LEARN)  # differences of frame numbers
+        self._met_s = math.nan  # when the newest frame was there, as far as polls can tell
 
     def unwrap(self, frame: int) -> int:
         """The count of a 32-bit frame number, the one nearest to the newest frame."""
@@ -51,13 +57,22 @@ class FrameClock:
 
     def note(self, count: int, asked_s: float, polls: int) -> None:
         """A new frame was there when the device was asked at `asked_s`, after so many polls."""
-        change = -0.005 if polls > 1 else 0.005  # met at the first poll: go a little earlier
-        if self._step and count - self.count > self._step:
-            change = 0.05  # a frame was missed
-        self._lead = min(LARGEST_LEAD, max(0.0, self._lead + change))
+        period_s = self.period_s
+        steps = (count - self.count) / min(self._steps, default=count - self.count)
+        met_s = self._met_s + steps * period_s
+        if not period_s or polls > 2 or not abs(asked_s - met_s) < period_s:
+            met_s = asked_s
+        elif polls == 2:
+            met_s += LATER * period_s
+        elif steps > 1 and asked_s < self._met_s + 1.5 * period_s:  # one was lost although it was asked for in time
+            met_s -= MUCH_SOONER * period_s
+        else:
+            met_s -= period_s / len(self._recent)  # the fewer frames, the less sure the period
+        self._met_s = min(met_s, asked_s)
+        if self._recent:
+            self._steps.append(count - self.count)
         self.count = count
-        self._recent = [*self._recent[-KEPT_FRAMES:], (count, asked_s)]
-        self._step = min((b[0] - a[0] for a, b in zip(self._recent, self._recent[1:])), default=0)
+        self._recent.append((count, asked_s))
 
     @property
     def period_s(self) -> float:
@@ -65,13 +80,12 @@ class FrameClock:
         if len(self._recent) < FRAMES_TO_LEARN:
             return 0.0
         (first, since_s), (last, until_s) = self._recent[0], self._recent[-1]
-        return self._step * (until_s - since_s) / (last - first)
+        return min(self._steps) * (until_s - since_s) / (last - first)
 
     def wait_s(self, now_s: float) -> float:
         """How long to wait before the next poll after a new frame."""
-        if not self.period_s:
-            return 0.0
-        return max(0.0, self._recent[-1][1] + (1.0 - self._lead) * self.period_s - now_s)
+        period_s = self.period_s
+        return max(0.0, self._met_s + period_s - now_s) if period_s else 0.0
 
     def retry_s(self) -> float:
         """How long to wait after a poll that brought nothing new."""

@@ -6,6 +6,7 @@ import math
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import chain
 from typing import Optional
 
 from ModuleTrackingLib.ndi.crc import crc16
@@ -137,6 +138,9 @@ def parse_bx(reply: bytes, options: int) -> TrackingReply:
     return checked(TrackingReply(handles, system_status, strays))
 
 
+_HALVES = tuple((byte & 15, byte >> 4) for byte in range(256))
+
+
 def _bx_handle(cursor: _Cursor, options: int) -> HandleData:
     handle, code = cursor.byte(), cursor.byte()
     try:
@@ -153,7 +157,7 @@ def _bx_handle(cursor: _Cursor, options: int) -> HandleData:
         status, frame = (int(value) for value in cursor.take("<2I"))
     if options & TOOL_INFO:
         info = cursor.byte()
-        digits = tuple(int(digit, 16) for digit in reversed(cursor.raw(10).hex()))
+        digits = tuple(chain.from_iterable(_HALVES[byte] for byte in reversed(cursor.raw(10))))
     if options & STRAY_ACTIVE:
         stray_status = cursor.byte()
         if stray_status & 0x01 or (stray_status & 0x08 and options & REPORT_OUT_OF_VOLUME):

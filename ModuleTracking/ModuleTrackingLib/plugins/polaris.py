@@ -232,6 +232,7 @@ class PolarisTracker(Tracker):
         reply, at_s = conductor.result
         if reply.system_status & DIAGNOSTIC_PENDING and self.clock.now() - self._alert_asked_s > ALERT_EVERY_S:
             self._alert = self._ask_for_alert()
+            return self._next_frame(deadline_s)  # asking took its time: this frame is no longer the newest
         alert = self._alert if reply.system_status & DIAGNOSTIC_PENDING else ""
         count = max(0, poller.clock.count)
         return tool_poses(reply, session.tools, count, self._device_time(count / session.counter_hz, at_s), at_s, alert)

@@ -56,6 +56,17 @@ def test_frames_arrive_whole_and_in_order(a_tracker, a_stream):
     assert a_stream.state.frames == 200
 
 
+def test_waiting_ends_with_the_news_and_begins_anew_when_they_are_taken(a_tracker, a_stream):
+    assert a_stream.wait(10)  # the connection is news, too
+    a_stream.poll()
+    assert not a_stream.wait(0.01)
+    a_tracker.put([ok("Probe", a_pose(0), 1000)])
+    assert a_stream.wait(10)
+    assert a_stream.wait(0)
+    assert len(a_stream.poll()) == 1
+    assert not a_stream.wait(0)
+
+
 def test_a_full_queue_drops_the_oldest_and_counts(a_tracker, a_clock):
     with PoseStream(a_tracker, queue_frames=10, clock=a_clock) as stream:
         for k in range(50):

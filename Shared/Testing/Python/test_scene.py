@@ -34,6 +34,18 @@ def test_parents_are_roles_of_transforms():
         assert role.parent == "" or scene.role(role.parent).node_class == "LinearTransform"
 
 
+def test_a_transform_that_left_the_scene_is_not_found_again(an_empty_scene):
+    for leave in (an_empty_scene.RemoveNode, lambda node: an_empty_scene.Clear(False)):
+        node = scene.find_or_create("ProbeToReference")
+        assert scene.find("ProbeToReference") is node
+        leave(node)
+        assert scene.find("ProbeToReference") is None
+    node = scene.find_or_create("ProbeToReference")
+    node.RemoveAttribute(scene.ROLE_ATTRIBUTE)
+    assert scene.find("ProbeToReference") is None
+    assert scene.find_or_create("ProbeToReference") is not node
+
+
 def test_a_role_survives_renaming():
     node = scene.find_or_create("SurfacePoints")
     node.SetName("Punkte vom Dienstag")
