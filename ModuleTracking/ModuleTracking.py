@@ -23,11 +23,15 @@ from CranioNavLib.host import (  # noqa: E402
 from CranioNavLib.module_logic import ParametersInScene, describeModule  # noqa: E402
 from CranioNavLib.module_widget import PanelOfDevice  # noqa: E402
 from CranioNavLib.panel import Level, Reading, StepState, StepStatus  # noqa: E402
+from ModuleTrackingLib.base_watch import NEAR_MM, BaseWatch  # noqa: E402
 from ModuleTrackingLib.panel_description import PANEL, PointList, Tool, TrackingParameters  # noqa: E402
+from ModuleTrackingLib.tool_calibrator import Kind, ToolCalibrator, geometry_of  # noqa: E402
 from ModuleTrackingLib.tracker import PoseStatus, TrackerError  # noqa: E402
 
 POLL_MS = 5
 MOST_SHOWN = 300  # poses of a pivoting tool that its drawing is made of
+APART_MM = 2.0  # a point so near to the one read before is the same one again
+PLANNED = {PointList.LANDMARKS: "LandmarksCT", PointList.TARGETS: "TargetsCT"}  # where the names of the points come from
 TIP_HISTORY = 4096  # tip positions kept a tool: half a minute at 120 Hz
 LEVELS = {PoseStatus.OK: Level.GOOD, PoseStatus.OUT_OF_VOLUME: Level.WARNING}
 
@@ -63,9 +67,10 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         self.stream = None
         self._recorder = None
         self._tips = {}  # tool name -> [(time in s, ToolToReference)] of the last frames
-        self._pivot = None  # (tool, end in s, poses) while a tool is being pivoted
-        self._calibrated = {}  # tool name -> what calibration found
-        self._failure = ""  # why calibration refused the last poses
+        self._calibrator = ToolCalibrator()
+        self._base = BaseWatch()
+        self._identified = False  # since the tracker connected: do calibrations and check point belong to its tools?
+        self._failure = ""  # why there is no connection
 
     # Connection
 
@@ -74,7 +79,8 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         from ModuleTrackingLib.pose_stream import PoseStream
 
         tracker = self.createPlugin("tracker", self.parameters().read().tracker)
-        self.stream = PoseStream(tracker, {tool: _tipToMarker(found) for tool, found in self._calibrated.items()})
+        self._failure, self._identified = "", False
+        self.stream = PoseStream(tracker, {tool: found.tool_to_marker for tool, found in self._calibrator.found.items()})
         self.stream.start()
         return f"connecting to {tracker.title}"
 
@@ -113,7 +119,8 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
             self._writeStale()
         if self._recorder is not None:
             self._recorder.add_frames(frames)
-        self._finishPivot()
+        self._finishCalibration()
+        self._watchBase()
 
     def _writeFrame(self, frame):
         """Every tool at the time of this frame, in Reference."""
@@ -131,8 +138,7 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
                 tips = self._tips.setdefault(pose.tool, [])
                 tips.append((pose.host_time_s, matrix))
                 del tips[:-TIP_HISTORY]
-                if self._pivot is not None and self._pivot[0] == pose.tool:
-                    self._pivot[2].append(matrix)
+                self._calibrator.add(pose.tool, matrix)
 
     def _writeStale(self):
         """Tools without news lose their pose in the scene, too."""
@@ -145,49 +151,106 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
     # Calibration
 
     def startPivot(self):
-        """Collect poses of the chosen tool for `pivot_s`; `poll` then calibrates it."""
-        import time
-
-        wanted = self.parameters().read()
-        self._failure = ""
-        self._uncalibrate(wanted.tool.value)
-        self._pivot = (wanted.tool.value, time.monotonic() + wanted.pivot_s, [])
-        return f"pivot the {wanted.tool.value.lower()} for {wanted.pivot_s:.0f} s"
+        """Collect poses of the chosen tool, tilted to all sides, for `pivot_s`; `poll` then calibrates its tip."""
+        self._calibrate(Kind.PIVOT)
+        return f"pivot the {self._tool().lower()} for {self.parameters().read().pivot_s:.0f} s"
 
     def startPivotBlocked(self):
         """Why no tool can be calibrated now."""
-        return self._notConnected() or ("a tool is being pivoted" if self._pivot is not None else "")
+        return self._notConnected() or self._calibrating()
+
+    def startSpin(self):
+        """Collect poses of the chosen tool, rolled about itself, for `pivot_s`; `poll` then finds its axis."""
+        self._calibrate(Kind.SPIN)
+        return f"roll the {self._tool().lower()} for {self.parameters().read().pivot_s:.0f} s"
+
+    def startSpinBlocked(self):
+        """Why no axis can be found now."""
+        known = "" if self._tool() in self._calibrator.found else "pivot the tool first"
+        return self._notConnected() or self._calibrating() or known
 
     def cancelPivot(self):
         """Forget the poses collected."""
-        self._pivot = None
+        self._calibrator.cancel()
 
     def cancelPivotBlocked(self):
         """Why there is nothing to cancel."""
-        return "" if self._pivot is not None else "no tool is being pivoted"
+        return "" if self._calibrator.busy else "no tool is being calibrated"
 
-    def _uncalibrate(self, tool):
-        self._calibrated.pop(tool, None)
-        self.stream.calibrations.pop(tool, None)
-        self._tips.pop(tool, None)
+    def _tool(self):
+        return self.parameters().read().tool.value
 
-    def _finishPivot(self):
+    def _calibrating(self):
+        return "a tool is being calibrated" if self._calibrator.busy else ""
+
+    def _calibrate(self, kind):
         import time
 
-        import numpy as np
-        from ModuleTrackingLib.calibration.pivot import calibrate_pivot
+        self._useFolder()
+        self._calibrator.begin(kind, self._tool(), time.monotonic() + self.parameters().read().pivot_s)
+        self._useCalibration(self._tool())
 
-        if self._pivot is None or time.monotonic() < self._pivot[1]:
+    def _finishCalibration(self):
+        import time
+
+        self._identify()
+        tool = self._calibrator.busy
+        if tool and self._calibrator.finish(time.monotonic(), geometry_of(tool, self.stream.tools)) is not None:
+            self._useCalibration(tool)
+
+    def _identify(self):
+        """Once the tracker has told its tools: take up what is saved of them, and drop what is of others."""
+        if self._identified or not self.stream.state.connected or not self.stream.tools:
             return
-        tool, _, poses = self._pivot
-        self._pivot = None
-        try:
-            self._calibrated[tool] = calibrate_pivot(np.reshape(poses, (-1, 4, 4)), np.random.default_rng(0))
-        except InputError as error:
-            self._failure = str(error)
-            return
-        self.stream.calibrations[tool] = _tipToMarker(self._calibrated[tool])
+        self._identified = True
+        self._useFolder()
+        for tool in (tool.value for tool in Tool):
+            self._calibrator.load(tool, geometry_of(tool, self.stream.tools))
+            self._useCalibration(tool)
+        self._base.load(self._referenceId())
+
+    def _useFolder(self):
+        self._calibrator.folder = self._base.folder = self.parameters().read().calibration_folder
+
+    def _useCalibration(self, tool):
+        """What is known of a tool, into the stream; tips of before are no longer comparable."""
+        known = self._calibrator.tool_to_marker(tool)
+        if known is None:
+            self.stream.calibrations.pop(tool, None)
+        else:
+            self.stream.calibrations[tool] = known
         self._tips.pop(tool, None)
+
+    # The reference base
+
+    def storeCheckPoint(self):
+        """Keep where the stylus rests now, in the divot on the clamp. Returns a message."""
+        self._useFolder()
+        self._base.store(self._restingTips(Tool.STYLUS.value), self._referenceId())
+        return self._base.words()
+
+    def storeCheckPointBlocked(self):
+        """Why the divot cannot be stored now."""
+        return self._notConnected() or self._calibrating()
+
+    def checkBase(self):
+        """Compare the divot with the stored place. Returns a message."""
+        return self._base.check(self._restingTips(Tool.STYLUS.value)).message
+
+    def checkBaseBlocked(self):
+        """Why the base cannot be checked now."""
+        return self.storeCheckPointBlocked() or ("" if self._base.point is not None else "store the check point first")
+
+    def _watchBase(self):
+        """A stylus that rests in the divot checks the base by itself."""
+        if self._base.point is not None and not self._calibrator.busy and self._tips.get(Tool.STYLUS.value):
+            taken = self._tips[Tool.STYLUS.value]
+            since = taken[-1][0] - self.parameters().read().rest_s
+            if taken[0][0] <= since and np.linalg.norm(taken[-1][1][:3, 3] - self._base.point.position_mm) < NEAR_MM:
+                self._base.notice([pose[:3, 3] for time_s, pose in taken if time_s > since])
+
+    def _referenceId(self):
+        return geometry_of("Reference", self.stream.tools).tool_id
 
     # Points
 
@@ -197,20 +260,36 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         from ModuleTrackingLib.digitise import rest_of_tip
 
         wanted = self.parameters().read()
-        tool = wanted.tool.value
-        current = self.stream.current_in_reference(tool)
-        if not current.usable:
-            raise InputError(f"the {tool.lower()} has no pose ({current.reason}); show it to the camera and read the point again")
-        tips = [pose[:3, 3] for taken, pose in self._tips.get(tool, []) if taken > current.host_time_s - wanted.rest_s]
-        rest = rest_of_tip(tips)
+        rest = rest_of_tip(self._restingTips(wanted.tool.value))
         label = self._nextLabel(wanted.points)
         node = scene.find_or_create(wanted.points.value)
+        self._refuseTwice(node, rest.position_mm, label)
         add_points(node, LabelledPoints((label,), rest.position_mm[None]))
         return f"{label}: {rest.samples} samples, spread {rest.spread_mm:.2f} mm (RMS)"
 
+    def _refuseTwice(self, node, position, label):
+        """A key pressed twice must not make the next point of the place of the last."""
+        import numpy as np
+
+        last = node.GetNumberOfControlPoints() - 1
+        if last >= 0 and np.linalg.norm(np.array(node.GetNthControlPointPosition(last)) - position) < APART_MM:
+            raise InputError(
+                f"the tip still rests on {node.GetNthControlPointLabel(last)}; move it to {label} and read the point"
+            )
+
     def digitiseBlocked(self):
         """Why no point can be read now."""
-        return self._notConnected() or ("a tool is being pivoted" if self._pivot is not None else "")
+        if self._allRead(self.parameters().read().points):
+            return "every planned point is read; undo the last to read it again"
+        return self._notConnected() or self._calibrating()
+
+    def _restingTips(self, tool):
+        """The tool's tips of the last `rest_s`, in Reference."""
+        current = self.stream.current_in_reference(tool)
+        if not current.usable:
+            raise InputError(f"the {tool.lower()} has no pose ({current.reason}); show it to the camera and read the point again")
+        since = current.host_time_s - self.parameters().read().rest_s
+        return [pose[:3, 3] for taken, pose in self._tips.get(tool, []) if taken > since]
 
     def undoPoint(self):
         """Remove the last point of the chosen list. Returns a message."""
@@ -228,12 +307,17 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
     def _nextLabel(self, points):
         """The first planned label that is not taken yet; a number where nothing is planned."""
         taken = self._labels(points.value)
-        planned = {PointList.LANDMARKS: "LandmarksCT", PointList.TARGETS: "TargetsCT"}.get(points)
-        free = [label for label in self._labels(planned) if label not in taken] if planned else []
+        free = [label for label in self._planned(points) if label not in taken]
         if free:
             return free[0]
         letter = {PointList.LANDMARKS: "L", PointList.BONE: "B", PointList.TARGETS: "T", PointList.PLAUSIBILITY: "P"}[points]
         return f"{letter}{len(taken) + 1}"
+
+    def _planned(self, points):
+        return self._labels(PLANNED[points]) if points in PLANNED else []
+
+    def _allRead(self, points):
+        return bool(self._planned(points)) and set(self._planned(points)) <= set(self._labels(points.value))
 
     def _labels(self, role):
         node = scene.find(role)
@@ -290,31 +374,33 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         if self.stream is None:
             return None
         pose = self.stream.current("Reference")
+        if self._base.loose:
+            return Reading(self._base.words(), Level.BAD)
         return Reading(", ".join(pose.flags) or pose.status.value, LEVELS.get(pose.status, Level.BAD))
 
     def probeTool(self):
         """The probe."""
-        return self._tool("Probe")
+        return self._seen("Probe")
 
     def stylusTool(self):
         """The stylus."""
-        return self._tool("Stylus")
+        return self._seen("Stylus")
 
     def sphereTool(self):
         """The sphere tool."""
-        return self._tool("Sphere")
+        return self._seen("Sphere")
 
-    def _tool(self, tool):
+    def _seen(self, tool):
         if self.stream is None:
             return None
         pose = self.stream.current_in_reference(tool)
         return Reading(pose.reason or pose.status.value, LEVELS.get(pose.status, Level.BAD))
 
     def pivotProgress(self):
-        """How many poses have been collected."""
-        if self._failure and self._pivot is None:
-            return Reading(self._failure, Level.BAD)
-        return Reading(f"{len(self._pivot[2])} poses") if self._pivot is not None else None
+        """How many poses have been collected, or why they were refused."""
+        if self._calibrator.busy:
+            return Reading(f"{len(self._calibrator.poses)} poses")
+        return Reading(self._calibrator.failure, Level.BAD) if self._calibrator.failure else None
 
     def pivotAdvice(self):
         """To which side the tool has to be tilted further, while it is being pivoted."""
@@ -335,24 +421,28 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         from CranioNavLib.rigid import invert_rigid
         from ModuleTrackingLib.calibration.coverage import tilt_coverage
 
-        if self._pivot is None:
+        if self._calibrator.kind is not Kind.PIVOT:
             return None
         camera = np.zeros(3)
         if scene.find("ReferenceToTracker") is not None:
             camera = invert_rigid(scene_data.get_transform("ReferenceToTracker"))[:3, 3]
-        poses = self._pivot[2]
+        poses = self._calibrator.poses
         return tilt_coverage(poses[:: -(1 + len(poses) // MOST_SHOWN)][::-1], camera) if poses else None  # the last stays
 
     def calibration(self):
         """The calibration of the chosen tool."""
-        found = self._calibrated.get(self.parameters().read().tool.value)
-        if found is None:
-            return None
-        return Reading(f"found, SD {found.tip_sd_mm:.2f} mm in the worst direction", Level.GOOD)
+        words = self._calibrator.words(self._tool())
+        return Reading(words, Level.GOOD) if words else None
+
+    def baseCheck(self):
+        """Whether the reference base still sits where it sat."""
+        checked = Level.GOOD if self._base.result is not None else Level.PLAIN
+        return Reading(self._base.words(), Level.BAD if self._base.loose else checked)
 
     def nextPoint(self):
         """The label that the next point gets."""
-        return Reading(self._nextLabel(self.parameters().read().points))
+        points = self.parameters().read().points
+        return Reading("all are read", Level.GOOD) if self._allRead(points) else Reading(self._nextLabel(points))
 
     def trackerStatus(self):
         """Whether poses arrive."""
@@ -363,10 +453,15 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
     def calibrationStatus(self):
         """Whether the chosen tool is calibrated."""
-        if self._failure and self.stream is not None:
-            return StepStatus(StepState.ATTENTION, self._failure)
-        done = self.parameters().read().tool.value in self._calibrated
+        if self._calibrator.failure and self.stream is not None:
+            return StepStatus(StepState.ATTENTION, self._calibrator.failure)
+        done = self._tool() in self._calibrator.found
         return StepStatus(StepState.DONE if done else StepState.TODO, "" if done else "pivot the tool, unless it is calibrated")
+
+    def baseStatus(self):
+        """Whether the base is known to be loose; a check point is worth its minute, but no step waits for it."""
+        wrong = self._base.loose or bool(self._base.refused and self._base.point is None)
+        return StepStatus(StepState.ATTENTION if wrong else StepState.DONE, self._base.words())
 
     def pointsStatus(self):
         """Whether every planned landmark is digitised."""
@@ -377,14 +472,6 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
     def _notConnected(self):
         return "" if self.stream is not None else "connect the tracker first"
-
-
-def _tipToMarker(found):
-    """The calibrated tool's frame in its marker's: same axes, origin at the tip."""
-    import numpy as np
-    from CranioNavLib.rigid import rigid
-
-    return rigid(np.eye(3), found.tip_in_marker_mm)
 
 
 class ModuleTrackingTest(ScriptedLoadableModuleTest):
@@ -439,8 +526,8 @@ class ModuleTrackingTest(ScriptedLoadableModuleTest):
         logic.parameters().change(tool=Tool.STYLUS, pivot_s=5.0)
         logic.startPivot()
         self._run(5.3)
-        assert "Stylus" in logic._calibrated, logic.pivotProgress()
-        error = np.linalg.norm(logic._calibrated["Stylus"].tip_in_marker_mm - constants.STYLUS_TIP_MM)
+        assert "Stylus" in logic._calibrator.found, logic.pivotProgress()
+        error = np.linalg.norm(logic._calibrator.found["Stylus"].tool_to_marker[:3, 3] - constants.STYLUS_TIP_MM)
         assert error < self.TIP_TOLERANCE_MM, f"tip is wrong by {error:.2f} mm"
         self.delayDisplay(f"tip found to {error:.2f} mm")
         with tempfile.TemporaryDirectory() as folder:

@@ -110,6 +110,17 @@ def run_for(logic, seconds):
     run_until(logic, lambda: time.monotonic() > end)
 
 
+def read_point(logic):
+    """Read the resting tip as a user does: try again while it is refused."""
+    for _ in range(40):
+        run_for(logic, 0.25)
+        try:
+            return logic.digitise()
+        except InputError:
+            continue
+    return logic.digitise()
+
+
 def test_poses_reach_the_scene_relative_to_the_reference_base(a_logic):
     a_logic.connect()
     run_until(a_logic, seen())
@@ -159,9 +170,9 @@ def test_pivoting_calibrates_the_tip_and_the_scene_shows_it_from_then_on(a_logic
     run_until(a_logic, seen())
     a_logic.parameters().change(pivot_s=1.0)
     a_logic.startPivot()
-    assert a_logic.digitiseBlocked() == "a tool is being pivoted"
-    run_until(a_logic, lambda: "Stylus" in a_logic._calibrated)
-    np.testing.assert_allclose(a_logic._calibrated["Stylus"].tip_in_marker_mm, TIP, atol=1e-6)
+    assert a_logic.digitiseBlocked() == "a tool is being calibrated"
+    run_until(a_logic, lambda: "Stylus" in a_logic._calibrator.found)
+    np.testing.assert_allclose(a_logic._calibrator.found["Stylus"].tool_to_marker[:3, 3], TIP, atol=1e-6)
     run_for(a_logic, 0.1)
     np.testing.assert_allclose(scene_data.get_transform("StylusToReference")[:3, 3], DIVOT, atol=1e-6)
     assert a_logic.calibrationStatus().state is StepState.DONE
@@ -172,8 +183,8 @@ def test_a_tool_held_still_cannot_be_calibrated_and_the_panel_says_why(a_logic):
     run_until(a_logic, seen())
     a_logic.parameters().change(pivot_s=1.0)
     a_logic.startPivot()
-    run_until(a_logic, lambda: a_logic._pivot is None)
-    assert "Stylus" not in a_logic._calibrated
+    run_until(a_logic, lambda: not a_logic._calibrator.busy)
+    assert "Stylus" not in a_logic._calibrator.found
     assert "tilt" in a_logic.pivotProgress().text
     assert a_logic.calibrationStatus().state is StepState.ATTENTION
 
@@ -182,17 +193,29 @@ def test_points_get_the_planned_labels_in_order_and_can_be_undone(a_logic):
     planned = LabelledPoints(("Nasion", "Left", "Right"), np.eye(3) * 50)
     scene_data.set_points("LandmarksCT", planned)
     a_logic.connect()
-    for label in planned.labels:
-        run_for(a_logic, 0.15)
+    places = DIVOT + planned.positions_mm
+    for label, place in zip(planned.labels, places, strict=True):
+        Script.tools = {"Stylus": rigid(np.eye(3), place)}
         assert a_logic.nextPoint().text == label
-        a_logic.digitise()
+        read_point(a_logic)
     touched = scene_data.get_points("LandmarksPatient")
     assert touched.labels == planned.labels
-    np.testing.assert_allclose(touched.positions_mm, [DIVOT] * 3, atol=1e-9)
+    np.testing.assert_allclose(touched.positions_mm, places, atol=1e-9)
+    assert a_logic.nextPoint().text == "all are read"
+    assert "every planned point is read" in a_logic.digitiseBlocked()
     assert a_logic.pointsStatus().state is StepState.DONE
     assert a_logic.undoPoint() == "Right removed"
     assert a_logic.nextPoint().text == "Right"
     assert "Right" in a_logic.pointsStatus().text
+
+
+def test_a_key_pressed_twice_does_not_make_two_points_of_one_place(a_logic):
+    scene_data.set_points("LandmarksCT", LabelledPoints(("Nasion", "Left", "Right"), np.eye(3) * 50))
+    a_logic.connect()
+    read_point(a_logic)
+    with pytest.raises(InputError, match="still rests on Nasion; move it to Left"):
+        a_logic.digitise()
+    assert scene_data.get_points("LandmarksPatient").labels == ("Nasion",)
 
 
 def test_a_moving_tip_is_no_point(a_logic):
