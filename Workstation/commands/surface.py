@@ -32,7 +32,7 @@ def surface(
         say("reading the CT", 0.0)
         volume = read_ct(ct, series=series)
         say("segmenting bone", 0.3)
-        settings = {} if threshold is None else {"threshold_hu": str(threshold)}
+        settings = {} if threshold is None else {"threshold_hu": threshold}
         bone = segment_bone(volume, method=method, **settings)
         mesh = bone.outer_table if outer else bone.closed
         say("writing", 0.95)

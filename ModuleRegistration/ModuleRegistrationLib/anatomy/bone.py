@@ -94,7 +94,12 @@ def tissue_levels(volume: Volume, head: Head) -> tuple[float, float, float]:
 
 
 def _otsu(values: npt.NDArray[np.int16]) -> float:
-    """Otsu's threshold (IEEE Trans. SMC 9:62, 1979): the split with the largest variance between its two classes."""
+    """Otsu's threshold (IEEE Trans. SMC 9:62, 1979): the split with the largest variance between its two classes.
+
+    Below all values where they are all the same, as in a phantom of one material.
+    """
+    if values.min() == values.max():
+        return float(values.min()) - 1
     counts, edges = np.histogram(values, bins=128)
     centers = (edges[1:] + edges[:-1]) / 2
     below = np.cumsum(counts)

@@ -199,4 +199,6 @@ def _reason(error: Exception) -> str:
     """The telling last line of an ITK exception."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     last = lines[-1] if lines else "unknown error"
-    return last.split("): ")[-1][:160]
+    if "Unable to determine ImageIO reader" in last:
+        return "it is no image of the kind its name says, or damaged"
+    return last.split("): ")[-1].replace("sitk::ERROR: ", "")[:160]
