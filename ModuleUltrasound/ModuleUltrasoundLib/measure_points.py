@@ -12,9 +12,10 @@ from CranioNavLib.sequence_metafile import Recording
 
 SWEEP_EXTENT_MM = 8.0  # a hand that holds a probe on one spot wanders by 1 to 3 mm; a sweep covers centimetres
 SPACING_MM = 2.0  # of a sweep's points: about two beam widths, so that neighbours see different bone
+PATCH_MM = 1.0  # frames within this of a sweep's point are averaged: on a rim of 10 mm radius bone bends 0.05 mm over it
 OUTLIER_SDS = 3.0
 LEAST_SPREAD_MM = 0.15  # frames of a dwell nearer than this to their median along the beam are never outliers
-HAND_SD_MM = 0.05  # what does not average out of a dwell along the beam: probe shape, tool calibration, pulse
+HAND_SD_MM = 0.05  # what does not average out of a dwell or a patch along the beam: probe shape, tool calibration, pulse
 MEDIAN_TO_SD = 1.4826
 
 
@@ -57,8 +58,8 @@ def bone_points(recording: Recording, measurements: Lines) -> BonePoints:
 
     Frames that share a palpation point while the probe dwells give one point each (the robust mean of the accepted
     frames, its covariance from their scatter and the model). Where no palpation point is given, or the probe moves over
-    more than `SWEEP_EXTENT_MM` under one number, the frames are a sweep: accepted frames thinned to one every
-    `SPACING_MM`, the most certain first. `groups` is the palpation point, or -1 for a sweep without one.
+    more than `SWEEP_EXTENT_MM` under one number, the frames are a sweep: one point every `SPACING_MM`, the mean of the most
+    certain frame and of those around it. `groups` is the palpation point, or -1 for a sweep without one.
     """
     chosen: list[npt.NDArray[np.int64]] = []  # the frames behind each point
     labels: list[str] = []
@@ -71,8 +72,11 @@ def bone_points(recording: Recording, measurements: Lines) -> BonePoints:
             labels.append(f"P{group}")
             groups.append(group)
             continue
-        thinned = thin(measurements.positions_mm[frames], measurements.qualities[frames])
-        chosen += [frames[[index]] for index in thinned]
+        # where the beam entered the tissue: unlike the bone points, these places do not scatter with the depths they choose
+        entries = measurements.positions_mm[frames] - measurements.depths_mm[frames, None] * measurements.beam_directions[frames]
+        thinned = thin(entries, measurements.qualities[frames])
+        patches = patches_of(entries, thinned)
+        chosen += [keep_agreeing(measurements, frames[patch]) for patch in patches]
         labels += [f"S{frames[index]}" for index in thinned]
         groups += [group] * len(thinned)
     return combine(measurements, chosen, tuple(labels), np.array(groups, dtype=np.int64))
@@ -110,6 +114,18 @@ def thin(positions: Array, qualities: Array) -> npt.NDArray[np.int64]:
         taken.setdefault((int(cell[0]), int(cell[1]), int(cell[2])), []).append(index)
         kept.append(index)
     return np.array(sorted(kept), dtype=np.int64)
+
+
+def patches_of(positions: Array, centres: npt.NDArray[np.int64]) -> list[npt.NDArray[np.int64]]:
+    """Indices of the frames around each centre that see the same bone: each frame counts once, for the nearest centre."""
+    from scipy.spatial import KDTree
+
+    if not len(centres):
+        return []
+    distance, nearest = KDTree(positions[centres]).query(positions)
+    near = np.flatnonzero(distance <= PATCH_MM)
+    order = near[np.argsort(nearest[near], kind="stable")]
+    return np.split(order, np.searchsorted(nearest[order], np.arange(1, len(centres))))
 
 
 def combine(
@@ -154,7 +170,7 @@ def combine(
 
 
 def along_variance(along: Array, weight: Array, model: Array) -> float:
-    """Variance along the beam of a dwell's mean: the larger of what the model and the scatter say, and a floor."""
+    """Variance along the beam of the mean of a dwell or a patch: the larger of what the model and the scatter say, and a floor."""
     predicted = float((weight**2 * model).sum())
     if len(along) < 3:
         return predicted + HAND_SD_MM**2

@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition, Recording
 from ModuleUltrasoundLib.measure import LineMeasurements
-from ModuleUltrasoundLib.measure_points import SPACING_MM, bone_points, thin
-from scipy.spatial.distance import pdist
+from ModuleUltrasoundLib.measure_points import HAND_SD_MM, SPACING_MM, bone_points, thin
+from scipy.spatial.distance import pdist, squareform
 
 
 def measured(positions, points, beams=None, accepted=None, quality=0.95, along_sd=0.05):
@@ -74,12 +76,35 @@ def sweep(rng, count=3000):
     return np.column_stack([along, 5 * np.sin(along / 10), rng.normal(0, 0.05, count)])
 
 
+def test_frames_around_a_point_of_a_sweep_sharpen_it_down_to_what_they_share():
+    rng = np.random.default_rng(5)
+    noisy = sweep(rng)
+    noisy[:, 2] += rng.normal(0, 0.3, len(noisy))
+    recording, lines = measured(noisy, np.full(len(noisy), -1), along_sd=0.3)
+    lines = replace(lines, depths_mm=6 - noisy[:, 2])  # the beam points down
+    result = bone_points(recording, lines)
+    error = result.positions_mm[:, 2]
+    assert np.sqrt(np.mean(error**2)) < 0.1  # of 0.3 mm a frame
+    own = result.covariances_mm2[:, 2, 2] - HAND_SD_MM**2  # without what the frames share, which does not average out
+    assert own.min() >= 0
+    assert 0.7 < np.sqrt(np.mean(error**2 / own)) < 1.3
+
+
+def test_frames_of_another_layer_do_not_move_a_point_of_a_sweep():
+    rng = np.random.default_rng(6)
+    some = sweep(rng)
+    some[::7, 2] += 0.9  # a galea echo
+    result = bone_points(*measured(some, np.full(len(some), -1)))
+    assert (np.abs(result.positions_mm[:, 2]) < 0.2).mean() > 0.85
+
+
 @pytest.mark.parametrize("point", [-1, 4])
 def test_sweep_is_thinned_to_an_even_density(point):
     rng = np.random.default_rng(3)
     result = bone_points(*measured(sweep(rng), np.full(3000, point)))
     assert 30 < len(result) < 60
-    assert pdist(result.positions_mm).min() >= SPACING_MM
+    assert pdist(result.positions_mm).min() >= 0.6 * SPACING_MM  # means lie off the frames they were taken around
+    assert np.median(np.sort(squareform(pdist(result.positions_mm)), axis=1)[:, 1]) > 0.9 * SPACING_MM
     assert set(result.groups.tolist()) == {point}
     assert all(label.startswith("S") for label in result.labels)
 
