@@ -170,7 +170,7 @@ def combine(
 
 
 def along_variance(along: Array, weight: Array, model: Array) -> float:
-    """Variance along the beam of the mean of a dwell or a patch: the larger of what the model and the scatter say, and a floor."""
+    """Variance along the beam of the mean of a dwell or a patch: the larger of model and scatter, and a floor."""
     predicted = float((weight**2 * model).sum())
     if len(along) < 3:
         return predicted + HAND_SD_MM**2
