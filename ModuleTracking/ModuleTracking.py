@@ -23,7 +23,7 @@ from CranioNavLib.host import (  # noqa: E402
 from CranioNavLib.module_logic import ParametersInScene, describeModule  # noqa: E402
 from CranioNavLib.module_widget import PanelOfDevice  # noqa: E402
 from CranioNavLib.panel import Level, Reading, StepState, StepStatus  # noqa: E402
-from ModuleTrackingLib.base_watch import NEAR_MM, BaseWatch  # noqa: E402
+from ModuleTrackingLib.base_watch import BaseWatch  # noqa: E402
 from ModuleTrackingLib.panel_description import PANEL, PointList, Tool, TrackingParameters  # noqa: E402
 from ModuleTrackingLib.tool_calibrator import Kind, ToolCalibrator, geometry_of  # noqa: E402
 from ModuleTrackingLib.tracker import PoseStatus, TrackerError  # noqa: E402
@@ -32,6 +32,7 @@ POLL_MS = 5
 MOST_SHOWN = 300  # poses of a pivoting tool that its drawing is made of
 APART_MM = 2.0  # a point so near to the one read before is the same one again
 PLANNED = {PointList.LANDMARKS: "LandmarksCT", PointList.TARGETS: "TargetsCT"}  # where the names of the points come from
+CHECK_S, CHECK_FRAMES = 0.5, 150  # a stylus that rests so long in the divot checks the base by itself; so many poses of it
 TIP_HISTORY = 4096  # tip positions kept a tool: half a minute at 120 Hz
 LEVELS = {PoseStatus.OK: Level.GOOD, PoseStatus.OUT_OF_VOLUME: Level.WARNING}
 
@@ -214,9 +215,11 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
     def _useCalibration(self, tool):
         """What is known of a tool, into the stream; tips of before are no longer comparable."""
-        known = self._calibrator.tool_to_marker(tool)
+        known, before = self._calibrator.tool_to_marker(tool), self.stream.calibrations.get(tool)
+        if known is before:
+            return
         if known is None:
-            self.stream.calibrations.pop(tool, None)
+            del self.stream.calibrations[tool]
         else:
             self.stream.calibrations[tool] = known
         self._tips.pop(tool, None)
@@ -243,11 +246,11 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
     def _watchBase(self):
         """A stylus that rests in the divot checks the base by itself."""
-        if self._base.point is not None and not self._calibrator.busy and self._tips.get(Tool.STYLUS.value):
-            taken = self._tips[Tool.STYLUS.value]
-            since = taken[-1][0] - self.parameters().read().rest_s
-            if taken[0][0] <= since and np.linalg.norm(taken[-1][1][:3, 3] - self._base.point.position_mm) < NEAR_MM:
-                self._base.notice([pose[:3, 3] for time_s, pose in taken if time_s > since])
+        tips = self._tips.get(Tool.STYLUS.value)
+        if self._base.point is not None and tips and not self._calibrator.busy:
+            since = tips[-1][0] - CHECK_S
+            if tips[0][0] <= since:
+                self._base.notice([pose[:3, 3] for time_s, pose in tips[-CHECK_FRAMES:] if time_s > since])
 
     def _referenceId(self):
         return geometry_of("Reference", self.stream.tools).tool_id

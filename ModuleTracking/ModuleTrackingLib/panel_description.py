@@ -38,6 +38,7 @@ class TrackingParameters(Parameters):
     points: Annotated[PointList, "list that the next point goes to"] = PointList.LANDMARKS
     rest_s: Annotated[float, Limits(0.1, 10), "how long the tip must rest on a point"] = 0.7
     pivot_s: Annotated[float, Limits(1, 120), "how long the tool is pivoted for its calibration"] = 10.0
+    calibration_folder: Annotated[str, "folder that keeps calibrations and the check point"] = ""
     recording_path: Annotated[str, "recording of all tools (.igs.mha)"] = ""
 
 
@@ -65,18 +66,33 @@ PANEL = Panel(
         Step(
             name="calibration",
             title="Calibration",
-            help="Set the tip into a divot that does not move and pivot the tool by 30° to all sides.",
+            help="Set the tip into a divot that does not move and pivot the tool by 30° to all sides. "
+            "To know its axis too, roll it about itself afterwards.",
             items=(
                 ParameterField("tool"),
                 ParameterField("pivot_s", "Pivot for"),
+                FileField("calibration_folder", "Kept in", folder=True),
                 Action("startPivot", "Pivot", "Begin to collect poses; the calibration follows by itself", primary=True),
+                Action("startSpin", "Roll", "Begin to collect poses of the tool rolled about itself, by 90° or more"),
                 Action("cancelPivot", "Cancel", "Forget the poses collected"),
-                ReadOut("pivotProgress", "Pivot"),
+                ReadOut("pivotProgress", "Poses"),
                 ReadOut("pivotAdvice", "Do now", large=True),
                 Picture("pivotCone", "Sides to which the tool was tilted, seen from above it"),
                 ReadOut("calibration", "Tip"),
             ),
             status="calibrationStatus",
+        ),
+        Step(
+            name="base",
+            title="Reference base",
+            help="Rest the calibrated stylus in the divot on the head clamp and store the place. "
+            "Touch it again at any time: a base that has moved on its clamp is noticed.",
+            items=(
+                Action("storeCheckPoint", "Store", "Keep where the divot is now", primary=True),
+                Action("checkBase", "Check", "Compare the divot with the place that is stored"),
+                ReadOut("baseCheck", "Base"),
+            ),
+            status="baseStatus",
         ),
         Step(
             name="points",

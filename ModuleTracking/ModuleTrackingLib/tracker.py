@@ -49,6 +49,7 @@ class ToolInfo:
     part_number: str = ""
     serial_number: str = ""
     detail: str = ""
+    definition: str = ""  # fingerprint of the file that says where its markers are, where the host has it
 
 
 class Tracker(DevicePlugin):

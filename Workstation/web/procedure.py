@@ -21,7 +21,7 @@ PROCEDURE: tuple[ProcedureStep, ...] = (
     ProcedureStep("ct", "CT", ((SESSION, "resume"), (HAND, "patient"), (REGISTRATION, "ct"))),
     ProcedureStep("bone", "Bone and landmarks", ((REGISTRATION, "bone"), (REGISTRATION, "plan"))),
     ProcedureStep("devices", "Devices", ((TRACKING, "tracker"), (ULTRASOUND, "device"))),
-    ProcedureStep("calibration", "Calibration", ((HAND, "pivot"), (TRACKING, "calibration"))),
+    ProcedureStep("calibration", "Calibration", ((HAND, "pivot"), (TRACKING, "calibration"), (TRACKING, "base"))),
     ProcedureStep("landmarks", "Landmarks", ((HAND, "landmarks"), (TRACKING, "points"), (REGISTRATION, "landmarks"))),
     ProcedureStep(
         "ultrasound",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -183,8 +184,15 @@ class PolarisTracker(Tracker):
     def tools(self) -> list[ToolInfo]:
         """See Tracker.tools."""
         known = self._session.tools if self._session is not None else ()
+        files = {file.name: hashlib.sha256(file.rom).hexdigest()[:12] for file in self._plan.tool_files}
         return [
-            ToolInfo(tool.name, tool.info.part_number, tool.info.serial_number, f"handle {tool.handle:02X}, {tool.info.kind}")
+            ToolInfo(
+                tool.name,
+                tool.info.part_number,
+                tool.info.serial_number,
+                f"handle {tool.handle:02X}, {tool.info.kind}",
+                files.get(tool.name, ""),
+            )
             for tool in known
         ]
 
