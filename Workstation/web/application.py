@@ -96,6 +96,7 @@ class WorkstationApp(TrameApp):
 
     def _use_folder(self) -> None:
         """The modules write into the session's folder unless the user says otherwise."""
+        self.logics[TRACKING].parameters().change(calibration_folder=str(self.session.folder))
         self.logics[ULTRASOUND].parameters().change(recording_path=self.session.recording_path)
         self.logics[REGISTRATION].parameters().change(output_folder=str(self.session.folder))
 
