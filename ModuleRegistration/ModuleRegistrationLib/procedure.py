@@ -84,6 +84,7 @@ def register_case(
     segmentation: str = "threshold",
     progress: Optional[Progress] = None,
     limit_mm: float = LIMIT_MM,
+    series: Optional[str] = None,
 ) -> CaseResult:
     """Read, segment, register, judge and verify one case.
 
@@ -95,6 +96,8 @@ def register_case(
     progress : callable, optional
     limit_mm : float
         The error at a target that the probability of staying below is told for.
+    series : str, optional
+        Which series of a DICOM folder: its number, description or UID.
 
     Raises
     ------
@@ -106,7 +109,7 @@ def register_case(
     mode = case.mode(mode)
     method = _method_for(mode, method)
     say("reading the CT", 0.0)
-    volume = read_ct(case.ct)
+    volume = read_ct(case.ct, series)
     say("segmenting bone", 0.15)
     bone = segment_bone(volume, method=segmentation)
     say("registering landmarks", 0.5)

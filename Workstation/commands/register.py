@@ -14,6 +14,7 @@ def register(
     method: Annotated[Optional[str], typer.Option(help="registration plugin; see `cranionav plugins`")] = None,
     mode: Annotated[Optional[str], typer.Option(help="Ia, Ib, IIa, IIb or III; default: the richest the case allows")] = None,
     segmentation: Annotated[str, typer.Option(help="segmentation plugin")] = "threshold",
+    series: Annotated[Optional[str], typer.Option(help="which series, where the CT is a DICOM folder with several")] = None,
     limit: Annotated[float, typer.Option(metavar="MM", min=0.1, help="tell the probability that the error is below this")] = 2.0,
     load: Annotated[Optional[list[Path]], typer.Option(metavar="FILE", help="a Python file that registers plugins")] = None,
     json: Annotated[bool, typer.Option("--json", help="print registration.json on stdout")] = False,
@@ -35,7 +36,7 @@ def register(
     folder = output_folder(output)
     with progress_bar() as say:
         result = register_case(
-            read_case(case), mode, method, segmentation, progress=lambda step, share: say(step, 0.7 * share), limit_mm=limit
+            read_case(case), mode, method, segmentation, lambda step, share: say(step, 0.7 * share), limit_mm=limit, series=series
         )
         record = write_outputs(result, folder, progress=lambda step, share: say(step, 0.7 + 0.3 * share))
     if json:

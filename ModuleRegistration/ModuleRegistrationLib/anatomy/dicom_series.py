@@ -24,7 +24,7 @@ TAGS = [
 DIRECTORY_CLASS = "1.2.840.10008.1.3.10"  # DICOMDIR
 ENHANCED_CT_CLASS = "1.2.840.10008.5.1.4.1.1.2.1"
 FEWEST_SLICES = 4  # up to three slices are a localizer
-GAP_TOLERANCE = 0.1  # of the slice distance: positions are often rounded to 0.1 mm
+GAP_TOLERANCE, ROUNDING_MM = 0.1, 0.11  # of the slice distance, but positions are often rounded to 0.1 mm
 ORIENTATION_TOLERANCE = 1e-3
 TILT_TOLERANCE_MM = 0.01  # sideways drift from slice to slice above which the gantry was tilted
 
@@ -63,7 +63,7 @@ def read_dicom(path: Path, series: Optional[str] = None) -> tuple[Any, str]:
         if own is None:
             raise InputError(f"{path} is no DICOM file and no known volume format; use a DICOM folder, .nrrd, .nii.gz or .mha")
         series = str(own.header.SeriesInstanceUID) if series is None else series
-    chosen = _choose(_by_series(slices), series, folder)
+    chosen = _without_localizers(_choose(_by_series(slices), series, folder))
     name = _describe(chosen)
     _check_modality(chosen, name, folder)
     ordered, tilted = _sorted(_without_copies(chosen), name)
@@ -125,12 +125,20 @@ def _choose(groups: list[list[Slice]], series: Optional[str], folder: Path) -> l
     volumes = [group for group in groups if _is_ct(group) and len(group) >= FEWEST_SLICES]
     if len(volumes) == 1:  # beside localizers, dose reports and other modalities
         return volumes[0]
-    raise InputError(f"{folder} holds {len(groups)} series: {_listed(groups)}; say which by its number, series=NUMBER")
+    raise InputError(f"{folder} holds {len(groups)} series: {_listed(groups)}; say which by its number (--series NUMBER)")
 
 
 def _is_ct(group: Sequence[Slice]) -> bool:
-    header = group[0].header
-    return header.get("Modality", "") == "CT" and "LOCALIZER" not in [str(part).upper() for part in header.get("ImageType", [])]
+    return group[0].header.get("Modality", "") == "CT" and not _is_localizer(group[0])
+
+
+def _is_localizer(item: Slice) -> bool:
+    return "LOCALIZER" in [str(part).upper() for part in item.header.get("ImageType", None) or []]
+
+
+def _without_localizers(group: Sequence[Slice]) -> list[Slice]:
+    """The series without localizers filed under it; all of it where it holds nothing else."""
+    return [item for item in group if not _is_localizer(item)] or list(group)
 
 
 def _listed(groups: Sequence[Sequence[Slice]]) -> str:
@@ -207,14 +215,15 @@ def _sorted(group: Sequence[Slice], name: str) -> tuple[list[Slice], bool]:
 
 
 def _check_gaps(gaps: Array, along: Array, ordered: Sequence[Slice], name: str) -> None:
-    step = float(np.median(gaps))
+    middle = float(np.median(gaps))
+    step = float(gaps[np.abs(gaps - middle) <= 0.5 * middle].mean())  # rounded positions leave the median off by 0.1 mm
     if gaps.min() < 0.01 * max(step, 0.05):
         first = int(np.argmin(gaps))
         raise InputError(
             f"{name}: {ordered[first].path.name} and {ordered[first + 1].path.name} lie at the same position; "
             "it holds two reconstructions or phases, export one alone"
         )
-    uneven = np.flatnonzero(np.abs(gaps - step) > GAP_TOLERANCE * step)
+    uneven = np.flatnonzero(np.abs(gaps - step) > max(GAP_TOLERANCE * step, ROUNDING_MM))
     if len(uneven):
         first = int(uneven[0])
         missing = int(np.rint(gaps[first] / step)) - 1
@@ -243,11 +252,15 @@ def _read_voxels(ordered: Sequence[Slice], tilted: bool, name: str) -> Any:
     sitk: Any = importlib.import_module("SimpleITK")
     reader = sitk.ImageSeriesReader()
     reader.SetFileNames([str(item.path) for item in ordered])
+    told = sitk.ProcessObject.GetGlobalWarningDisplay()
+    sitk.ProcessObject.GlobalWarningDisplayOff()  # the positions are checked here, and better
     try:
         image = reader.Execute()
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise InputError(f"{name}: its voxels cannot be read ({lines[-1][:160]}); copy the series again") from None
+    finally:
+        sitk.ProcessObject.SetGlobalWarningDisplay(told)
     first, last = ordered[0], ordered[-1]
     rows, columns = first.orientation[:3], first.orientation[3:]
     normal = np.cross(rows, columns)

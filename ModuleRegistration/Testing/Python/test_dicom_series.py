@@ -95,7 +95,7 @@ def test_a_tilted_gantry_is_resampled_onto_a_rectangular_grid(a_dicom_folder, a_
 def test_several_series_are_listed_and_asked_for(a_dicom_folder, ball):
     a_dicom_folder(ball, name="all/a", number=3)
     folder = a_dicom_folder(Volume(ball.hu + np.int16(7), ball.ijk_to_ras), name="all/b", number=4).parent
-    refused(folder, r"2 series: number 3 \(CT, Head 2.0, 20 slices\); number 4 \(CT, Head 2.0, 20 slices\).*series=")
+    refused(folder, r"2 series: number 3 \(CT, Head 2.0, 20 slices\); number 4 \(CT, Head 2.0, 20 slices\).*--series NUMBER")
     assert read_ct(folder, series="4").hu.max() == ball.hu.max() + 7
     refused(folder, "no series '9'.*number 3", series="9")
 
@@ -105,6 +105,15 @@ def test_series_of_one_number_are_told_apart_by_their_uid(a_dicom_folder, ball):
     folder = a_dicom_folder(ball, name="all/b").parent
     refused(folder, r"UID 1\.2")
     refused(folder, "2 series .* match '3'", series="3")
+
+
+def test_localizers_within_the_series_are_passed_over(a_dicom_folder, ball):
+    def edit(item, index):
+        if index < 2:
+            item.ImageType = ["ORIGINAL", "PRIMARY", "LOCALIZER"]
+            item.ImageOrientationPatient = [1, 0, 0, 0, 0, -1]
+
+    assert read_ct(a_dicom_folder(ball, edit=edit)).hu.shape[0] == ball.hu.shape[0] - 2
 
 
 def test_a_localizer_beside_the_series_is_passed_over(a_dicom_folder, ball):
@@ -139,6 +148,20 @@ def test_a_changing_slice_distance_is_refused(a_dicom_folder, ball):
         item.ImagePositionPatient = [place[0], place[1], place[2] + max(0, index - 10) * 1.2]
 
     refused(a_dicom_folder(ball, edit=edit), "slice distance changes")
+
+
+@pytest.mark.parametrize("step", [1.5, 0.625, 0.4])
+def test_positions_rounded_to_a_tenth_of_a_millimetre_are_accepted(a_dicom_folder, ball, step, capfd):
+    matrix = ball.ijk_to_ras.copy()
+    matrix[2, 2], matrix[2, 3] = step, -20.25
+    many = Volume(np.concatenate([ball.hu] * 6), matrix)
+
+    def edit(item, index):
+        item.ImagePositionPatient = [f"{float(value):.1f}" for value in item.ImagePositionPatient]
+
+    spacing = Grid.of(read_ct(a_dicom_folder(many, edit=edit))).spacing_mm[0]
+    assert capfd.readouterr().err == ""  # nor does a library grumble about it
+    assert spacing == pytest.approx(step, abs=0.101 / (len(many.hu) - 1))
 
 
 def test_rounded_slice_positions_are_accepted(a_dicom_folder, ball):
