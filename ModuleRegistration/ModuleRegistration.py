@@ -589,7 +589,13 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         rows = self._rows()
         if parts[0] not in rows:
             return None
-        return Reading("".join(rows.get(part, part) for part in parts), level or LEVELS.get(self._status(), Level.PLAIN))
+        words = "".join(_inTenths(rows[part]) if part in rows else part for part in parts)
+        return Reading(words, level or LEVELS.get(self._status(), Level.PLAIN))
+
+
+def _inTenths(value):
+    """Tenths of a millimetre are what a reader can use; the table and the files keep all digits."""
+    return f"{float(value):.1f}" if "." in value else value
 
 
 def _hasContent(node):

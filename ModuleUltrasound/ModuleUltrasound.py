@@ -389,7 +389,7 @@ class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
     def probePose(self):
         """Whether the scene has a live pose of the probe."""
         status = scene_data.get_pose("ProbeToReference").status
-        return Reading(status, Level.GOOD if status == "OK" else Level.BAD)
+        return Reading("in view", Level.GOOD) if status == "OK" else Reading(f"not in view ({status.lower()})", Level.BAD)
 
     def depth(self):
         """The bone's depth under the probe now; None while there is no trustworthy echo."""
@@ -399,7 +399,7 @@ class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
             from ModuleUltrasoundLib.quality import reason_in_words
 
             return Reading(reason_in_words(self._live.reasons[-1]), Level.WARNING)
-        return Reading(f"{self._live.depths_mm[-1]:.2f}", Level.GOOD)
+        return Reading(f"{self._live.depths_mm[-1]:.1f}", Level.GOOD)
 
     def quality(self):
         """Probability that the depth is right to half a millimetre."""
@@ -426,7 +426,7 @@ class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         """Angle between the beam and the bone's normal."""
         if self._guide is None:
             return None
-        return Reading(f"{self._guide.angle_deg:.1f}", Level.GOOD if self._guide.aligned else Level.WARNING)
+        return Reading(f"{self._guide.angle_deg:.0f}", Level.GOOD if self._guide.aligned else Level.WARNING)
 
     def dwell(self):
         """How many points are taken, and what the present one still lacks."""

@@ -32,20 +32,29 @@ def crossing() -> Array | None:
 
 
 def go_to(position_ras_mm: npt.ArrayLike) -> None:
-    """Let all slices pass through a point, and show the crosshair there."""
+    """Let all slices pass through a point."""
     place = [float(value) for value in np.asarray(position_ras_mm, dtype=float)]
     for node in slice_nodes():
         node.JumpSliceByOffsetting(*place)
-    crosshair = host.scene().GetFirstNodeByClass("vtkMRMLCrosshairNode")
-    if crosshair is not None:
-        crosshair.SetCrosshairRAS(*place)
 
 
-def show_crosshair(shown: bool) -> None:
-    """Lines through the crosshair's place in all slices, or none."""
-    crosshair = host.scene().GetFirstNodeByClass("vtkMRMLCrosshairNode")
-    if crosshair is None:
-        return
-    wanted = crosshair.ShowBasic if shown else crosshair.NoCrosshair
-    if crosshair.GetCrosshairMode() != wanted:
-        crosshair.SetCrosshairMode(wanted)
+def zoom_on(position_ras_mm: npt.ArrayLike, width_mm: float) -> None:
+    """Put a point into the middle of all slices, which show so many millimetres about it."""
+    place = [float(value) for value in np.asarray(position_ras_mm, dtype=float)]
+    for node in slice_nodes():
+        across, up, deep = node.GetFieldOfView()
+        scale = width_mm / min(across, up)
+        if abs(scale - 1) > 0.01:
+            node.SetFieldOfView(across * scale, up * scale, deep)
+        if any(node.GetXYZOrigin()[:2]):
+            node.SetXYZOrigin(0.0, 0.0, node.GetXYZOrigin()[2])
+        node.JumpSliceByCentering(*place)
+
+
+def show_crossing(shown: bool) -> None:
+    """In each slice lines where the others cut it, or none."""
+    scene = host.scene()
+    for index in range(scene.GetNumberOfNodesByClass("vtkMRMLSliceDisplayNode")):
+        node = scene.GetNthNodeByClass(index, "vtkMRMLSliceDisplayNode")
+        if bool(node.GetIntersectingSlicesVisibility()) != shown:
+            node.SetIntersectingSlicesVisibility(shown)

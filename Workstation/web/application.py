@@ -173,7 +173,7 @@ class WorkstationApp(TrameApp):
         logic = self.logics[NAVIGATION]
         wanted, found = logic.parameters().read(), logic.tip()
         if found is not None and wanted.follow:
-            self.views.follow(found[1])
+            self.views.follow(found[1], wanted.zoom)
         error = logic.error_mm(found[1]) if found is not None and wanted.ring else None
         self.views.ring(found[1] if found is not None else None, error)
 

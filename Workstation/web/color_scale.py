@@ -1,4 +1,4 @@
-"""Colours from dark blue over grey to yellow, which the colour-blind read by lightness; for views and page."""
+"""Colours from blue over grey to yellow, which the colour-blind read by lightness; for views and page."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from CranioNavLib import host
 from CranioNavLib.rigid import Array
 
 # Lightness rises evenly, blue turns to yellow: what both common kinds of red-green blindness keep.
-STOPS = np.array([[0, 34, 78], [66, 78, 108], [125, 124, 120], [188, 175, 111], [254, 232, 56]]) / 255
+STOPS = np.array([[52, 92, 190], [98, 122, 176], [146, 150, 150], [200, 188, 108], [254, 232, 56]]) / 255
 NAME = "CranioNav error scale"
 ENTRIES = 128
 

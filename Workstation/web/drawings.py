@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from CranioNavLib import scene
 
-WIDTH, HEIGHT = 300, 110  # of the A-line's drawing
+WIDTH, HEIGHT = 300, 76  # of the A-line's drawing
 COLUMNS = 150
 BULLS_EYE_DEG = 15.0  # at the rim
 
@@ -54,7 +54,7 @@ def a_line(logic: Any) -> dict[str, Any] | None:
         "bone": x(skin_s + 2e-3 * depth / speed) if found else None,
         "gate": gate,
         "accepted": accepted,
-        "text": f"{depth:.2f} mm" if found and accepted else reason_in_words(measured.reasons[-1] or "no echo"),
+        "text": f"bone {depth:.1f} mm deep" if found and accepted else reason_in_words(measured.reasons[-1] or "no echo"),
     }
 
 
@@ -70,7 +70,7 @@ def bulls_eye(logic: Any) -> dict[str, Any] | None:
         "y": round(50 - 45 * up / length, 1),
         "aligned": bool(guide.aligned),
         "good": bool(guide.on_target and guide.aligned and (live is None or live[2].accepted[-1])),
-        "text": f"{guide.distance_mm:.0f} mm from the point, {guide.angle_deg:.0f}° off the bone's normal",
+        "text": f"{guide.distance_mm:.0f} mm from the point, tilted by {guide.angle_deg:.0f}°",
         "ring": round(45 * 2.0 / BULLS_EYE_DEG, 1),
     }
 
@@ -91,5 +91,6 @@ def progress(logic: Any) -> list[dict[str, Any]]:
 
 
 def drawings(logic: Any) -> dict[str, Any]:
-    """All of them."""
-    return {"line": a_line(logic), "eye": bulls_eye(logic), "points": progress(logic)}
+    """All of them; `measured`: whether there are bone points and nothing is being recorded."""
+    measured = logic.recorded() is None and scene.find("SurfacePoints") is not None
+    return {"line": a_line(logic), "eye": bulls_eye(logic), "points": progress(logic), "measured": measured}

@@ -22,7 +22,7 @@ A_LINE = f"""
   <text x="0" y="{HEIGHT + 12}" fill="#b0bec5" font-size="11">A-line; the light band is the gate</text>
 </svg>"""
 BULLS_EYE = f"""
-<svg viewBox="0 0 100 100" width="120" role="img" aria-label="Tilt of the probe">
+<svg viewBox="0 0 100 100" width="96" role="img" aria-label="Tilt of the probe">
   <circle cx="50" cy="50" r="46" fill="#10151b" stroke="#546e7a"/>
   <circle cx="50" cy="50" r="23" fill="none" stroke="#37474f"/>
   <circle cx="50" cy="50" :r="live.eye.ring" fill="none" stroke="{GOOD}" stroke-width="2"/>
@@ -34,7 +34,7 @@ DOTS = """
   <div v-for="(one, index) in live.points" :key="index" :title="one.label" :class="'dot dot-' + one.state">{{ index + 1 }}</div>
 </div>"""
 STYLE = f"""
-.dot {{ width: 28px; height: 28px; border-radius: 50%; text-align: center; line-height: 24px; font-size: 13px;
+.dot {{ width: 27px; height: 27px; border-radius: 50%; text-align: center; line-height: 23px; font-size: 13px;
   border: 2px solid #546e7a; }}
 .dot-taken {{ background: {GOOD}; border-color: {GOOD}; color: #06251b; font-weight: 700; }}
 .dot-now {{ border-color: {WARNING}; color: {WARNING}; font-weight: 700; }}
@@ -45,11 +45,13 @@ def draw_live(step: str) -> None:
     """The drawings that belong to a step of the procedure, in the current trame context."""
     if step not in ("devices", "ultrasound"):
         return
+    # while a recording has been measured and none runs, the line says nothing that is needed
+    wanted = "live.line" + (" && !live.measured" if step == "ultrasound" else "")
     with html.Div(classes="in-sight mb-3", raw_attrs=['data-drawing="live"']):
         if step == "ultrasound":
-            html.Div(DOTS, v_if="live.points.length", classes="mb-3")
+            html.Div(DOTS, v_if="live.points.length", classes="mb-2")
             with html.Div(v_if="live.eye", classes="d-flex align-center mb-2", style="gap: 12px"):
                 html.Div(BULLS_EYE)
                 html.Div("{{ (live.eye.good ? '✓ ' : '! ') + live.eye.text }}", classes="text-h6")
-        html.Div(A_LINE, v_if="live.line")
-        html.Div("{{ (live.line.accepted ? '' : '! ') + live.line.text }}", v_if="live.line", classes="text-h5")
+        html.Div(A_LINE, v_if=wanted)
+        html.Div("{{ (live.line.accepted ? '' : '! ') + live.line.text }}", v_if=wanted, classes="text-h6")

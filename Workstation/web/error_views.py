@@ -15,7 +15,7 @@ MOST_MM = {MAP: 5.0, RESIDUALS: 2.0}  # the scale's end
 ERROR = "Expected error (mm)"
 RESIDUAL = "Residual (mm)"
 LEAST_SD_MM = 0.3  # of a point along the bone's normal: the surface is no better
-USED_MM, REJECTED_MM = 2.2, 3.2  # half the size of a point as drawn
+USED_MM, REJECTED_MM = 3.0, 4.5  # half the size of a point as drawn
 
 
 class ErrorViews:
@@ -40,7 +40,7 @@ class ErrorViews:
             return _legend("Expected error, 95 %", MAP, note)
         if has_points:
             rejected = scene_data.get_table("Residuals")["used"].count("no")
-            return _legend("Distance of a bone point to the bone", RESIDUALS, f"crosses: {rejected} left out" if rejected else "")
+            return _legend("Bone points: distance to the bone", RESIDUALS, f"crosses: {rejected} left out" if rejected else "")
         return None
 
     def _map(self, bone: Any) -> bool:
@@ -114,7 +114,7 @@ def residual_glyphs(positions_mm: Array, residuals_mm: Array, used: Array) -> An
         else:
             for axis in range(3):
                 bar = vtkCubeSource()
-                lengths = [0.8] * 3
+                lengths = [1.2] * 3
                 lengths[axis] = 2 * REJECTED_MM
                 bar.SetXLength(lengths[0])
                 bar.SetYLength(lengths[1])

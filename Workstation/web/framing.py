@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 MARGIN = 0.92  # share of the 3-D view that the skull takes up
+SEEN_COSINE = 0.35  # of the angle between a place's direction and the eye's
+STEEPEST = 0.7  # height of the eye, sine
 
 
 class Framing:
@@ -27,6 +29,28 @@ class Framing:
             self._fit(view, _fit_slice, _slice_stand)
         for view in self._manager.get_threed_views():
             view.reset_view()
+            self._fit(view, self._fit_3d, _camera_stand)
+
+    def fit_slices(self) -> None:
+        """Fit every slice view."""
+        for view in self._manager.get_slice_views():
+            self._fit(view, _fit_slice, _slice_stand)
+
+    def face(self, point_ras_mm: Any) -> None:
+        """Turn 3-D until a point on the skull is seen, unless it is seen already or the user has turned the view."""
+        bounds = self._bounds()
+        if bounds is None:
+            return
+        middle = np.add(bounds[::2], bounds[1::2]) / 2
+        outward = np.asarray(point_ras_mm, dtype=float) - middle
+        for view in self._manager.get_threed_views():
+            camera = view.renderer().GetActiveCamera()
+            sight = np.asarray(camera.GetPosition()) - middle
+            if self._touched.get(view.get_view_node_id()) or seen(outward, sight):
+                continue
+            camera.SetPosition(*(middle + facing(outward) * np.linalg.norm(sight)))
+            camera.SetFocalPoint(*middle)
+            camera.SetViewUp(0.0, 0.0, 1.0)
             self._fit(view, self._fit_3d, _camera_stand)
 
     def keep(self) -> None:
@@ -57,6 +81,21 @@ class Framing:
             view.set_focal_point(*(np.add(bounds[::2], bounds[1::2]) / 2))
             view.renderer().ResetCameraScreenSpace(bounds, MARGIN)
             view.schedule_render()
+
+
+def seen(outward: Any, sight: Any) -> bool:
+    """Whether a place of the skull in this direction from its middle is well seen by an eye in that direction."""
+    cosine = np.dot(outward, sight) / max(float(np.linalg.norm(outward) * np.linalg.norm(sight)), 1e-9)
+    return bool(cosine > SEEN_COSINE)
+
+
+def facing(outward: Any) -> Any:
+    """The direction (3,) from which to look at a place of the skull: in front of it, never from straight above or below."""
+    direction = np.asarray(outward, dtype=float) / max(float(np.linalg.norm(outward)), 1e-9)
+    level = direction[:2] if np.linalg.norm(direction[:2]) > 0.1 else np.array([0.0, 1.0])  # the top is looked at from the front
+    level = level / np.linalg.norm(level)
+    height = np.clip(direction[2], -0.2, STEEPEST)
+    return np.array([*(level * np.sqrt(1 - height**2)), height])
 
 
 def _fit_slice(view: Any) -> None:

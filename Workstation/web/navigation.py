@@ -21,6 +21,7 @@ class NavigationParameters(Parameters):
     """What navigation keeps in the scene."""
 
     follow: Annotated[bool, "slices go through the tool's tip"] = True
+    zoom: Annotated[bool, "slices show what is near the tip, so that a millimetre is seen"] = True
     ring: Annotated[bool, "the 95% error is drawn about the tip"] = True
 
 
@@ -35,6 +36,7 @@ PANEL = Panel(
             "Move a tool: the slices follow its tip. The ring holds the true place with 95% probability.",
             (
                 ParameterField("follow", "Slices follow the tip"),
+                ParameterField("zoom", "Zoom on the tip"),
                 ParameterField("ring", "Ring of the 95% error"),
                 ReadOut("leadingTool", "Tool"),
                 ReadOut("boneDistance", "To the bone", "mm", large=True),

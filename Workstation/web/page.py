@@ -25,14 +25,16 @@ html { overflow: hidden; }
 .views { display: flex; width: 100%; height: 100%; }
 .views div { min-width: 0; min-height: 0; }
 .v-application { font-size: 16px; }
+.v-btn { text-transform: none; letter-spacing: 0; font-size: 16px; }
+.v-btn--disabled.v-btn--variant-flat { background: #37474f !important; color: #b0bec5 !important; opacity: 1 !important; }
+.v-btn--disabled .v-btn__overlay { opacity: 0 !important; }
 .step-sign { width: 26px; height: 26px; border-radius: 50%; border: 2px solid currentColor;
   text-align: center; line-height: 22px; font-weight: 700; }
 .in-sight { position: sticky; top: 0; z-index: 2; padding-top: 10px; background: rgb(var(--v-theme-surface)); }
 .buttons { display: flex; flex-wrap: wrap; gap: 8px; margin: 8px 0; }
 .buttons > div { flex: 1 1 40%; min-width: 0; }
 .buttons > .wide { flex-basis: 100%; }
-.buttons .v-btn { letter-spacing: 0; text-transform: none; font-size: 16px; height: auto; min-height: 38px;
-  padding: 6px 8px; }
+.buttons .v-btn { height: auto; min-height: 38px; padding: 6px 8px; }
 .buttons .v-btn__content { white-space: normal; line-height: 1.15; }
 .part { border-top: 1px solid rgba(255, 255, 255, 0.12); padding-top: 12px; margin-top: 12px; }
 """

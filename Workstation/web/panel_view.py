@@ -132,11 +132,11 @@ class PanelView:
     def _draw_reading(self, item: ReadOut) -> None:
         reading = f"{self.key}.readings['{item.name}']"
         unit = f"(/^[-–]?[0-9]/.test({reading}.text) ? ' {item.unit}' : '')"  # words have no unit
-        with html.Div(classes="py-1", v_show="true" if item.large else f"{reading}.text !== '–'"):
+        with html.Div(classes="py-1", v_show=f"{reading}.text !== '–'"):
             html.Div(item.label, classes="text-caption text-medium-emphasis")
             html.Div(
                 f"{{{{ {SIGNS}[{reading}.level] + {reading}.text + {unit} }}}}",
-                classes="text-h4 font-weight-medium" if item.large else "text-body-1",
+                classes=(f"{reading}.text.length > 22 ? 'text-h6' : 'text-h4'",) if item.large else "text-body-1",
                 style=(f"{{ color: {COLORS}[{reading}.level], lineHeight: 1.2 }}",),
                 raw_attrs=[f'data-reading="{item.name}"'],
             )
@@ -263,7 +263,7 @@ class PanelView:
 def _is_setting(item: Item) -> bool:
     """What has a good value already, and so is shown only on request. Switches of a view are no settings."""
     if isinstance(item, ParameterField):
-        return item.name not in ("follow", "ring")
+        return item.name not in ("follow", "zoom", "ring")
     if isinstance(item, PluginField):
         return item.kind in ("segmentation", "registration")
     return isinstance(item, NodeField) or (isinstance(item, FileField) and item.name in OF_THE_SESSION)

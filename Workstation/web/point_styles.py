@@ -19,13 +19,12 @@ class PointStyle:
     size_mm: float
     glyph: str  # of vtkMRMLMarkupsDisplayNode
     steps: tuple[str, ...]  # of the procedure in which they are seen
-    named_in: tuple[str, ...] = ()  # steps in which the names stand beside them
 
 
 STYLES = {
     "LandmarksCT": PointStyle(5.0, "Sphere3D", ("ct", "bone", "devices", "calibration", "landmarks")),
     "LandmarksPatient": PointStyle(6.0, "ThickCross2D", ("landmarks",)),
-    "TargetsCT": PointStyle(4.0, "Diamond2D", ("bone", *LATER), ("navigation",)),
+    "TargetsCT": PointStyle(4.0, "Diamond2D", ("bone", *LATER)),
     "TargetsPatient": PointStyle(4.0, "ThickCross2D", ("verification",)),
     "ProtocolPoints": PointStyle(5.0, "Sphere3D", ("ultrasound",)),
     "SurfacePoints": PointStyle(4.0, "ThickCross2D", ("ultrasound",)),
@@ -53,7 +52,6 @@ class PointStyles:
                 self._styled.add(node.GetID())
             known = scene.role(role).parent == "" or registered()  # the patient's place is not known before
             _set(node.GetDisplayNode(), "Visibility", step in style.steps and known and not _replaced(role, residuals_drawn))
-            _set(node.GetDisplayNode(), "PointLabelsVisibility", step in style.named_in)
             _set(node, "Locked", not (role == "LandmarksCT" and step == "bone"))  # dragged only where they are planned
             if role in MARKED:
                 _mark(node, asked_for)
@@ -71,7 +69,7 @@ def _style(node: Any, style: PointStyle) -> None:
     display.SetUseGlyphScale(False)
     display.SetGlyphSize(style.size_mm)
     display.SetGlyphType(getattr(display, style.glyph))
-    display.SetTextScale(4.0)
+    display.SetPointLabelsVisibility(False)  # the one asked for is marked, and named beside the views
     display.SetPropertiesLabelVisibility(False)
     if node.GetAttribute(scene.ROLE_ATTRIBUTE) in MARKED:
         display.SetSelectedColor(*ASKED_FOR)  # selected is the one asked for

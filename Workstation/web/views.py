@@ -12,7 +12,8 @@ from Workstation.web.framing import Framing
 from Workstation.web.point_styles import PointStyles
 from Workstation.web.tool_models import ErrorRing, ToolModels
 
-WITH_CROSSHAIR = ("bone", "navigation")  # steps in which the place where the slices cross matters
+WITH_CROSSING = ("bone", "navigation")  # steps in which the place where the slices cross matters
+ZOOM_MM = 90.0  # shown about a tool's tip: a millimetre is then seen
 WITH_ERROR = ("landmarks", "ultrasound", "verification", "navigation", "report")
 
 
@@ -26,6 +27,7 @@ class ViewFollower:
         self._tools, self._ring = ToolModels(), ErrorRing()
         self._points, self._errors = PointStyles(), ErrorViews()
         self._image: Any = None
+        self._asked_for_in, self._zoomed = ("", ""), False
         for view in slicer_app.view_manager.get_threed_views():
             node = view.get_view_node()
             node.SetOrientationMarkerType(node.OrientationMarkerTypeAxes)
@@ -43,21 +45,42 @@ class ViewFollower:
         legend = self._errors.refresh(self._bone.node, error_shown if step in WITH_ERROR else "")
         self._points.refresh(step, legend is not None and error_shown == RESIDUALS, asked_for)
         self._tools.refresh(forerun_mm)
-        slice_views.show_crosshair(step in WITH_CROSSHAIR and scene.find("CT") is not None)
-        self._framing.keep()
+        slice_views.show_crossing(step in WITH_CROSSING and scene.find("CT") is not None)
+        if self._zoomed and step != "navigation":
+            self._zoomed = False
+            self._framing.fit_slices()
+        if not self._zoomed:
+            self._framing.keep()
+        self._look_at(step, asked_for)
         return legend
 
     def fit(self) -> None:
         """Frame all views anew."""
         self._framing.fit()
 
-    def follow(self, tip_ras_mm: Any) -> None:
-        """Let all slices pass through a point."""
-        slice_views.go_to(tip_ras_mm)
+    def follow(self, tip_ras_mm: Any, zoom: bool) -> None:
+        """Let all slices pass through a point; or show its surroundings alone."""
+        if zoom:
+            slice_views.zoom_on(tip_ras_mm, ZOOM_MM)
+        else:
+            slice_views.go_to(tip_ras_mm)
+        if self._zoomed and not zoom:
+            self._framing.fit_slices()
+        self._zoomed = zoom
 
     def ring(self, tip_ras_mm: Any, radius_mm: float | None) -> None:
         """The 95% error about a point; without a radius none."""
         self._ring.show(tip_ras_mm, radius_mm)
+
+    def _look_at(self, step: str, asked_for: str) -> None:
+        """Turn the head so that the point to palpate now is seen, when another one is asked for."""
+        if (step, asked_for) == self._asked_for_in:
+            return
+        self._asked_for_in = (step, asked_for)
+        node = scene.find("ProtocolPoints") if step == "ultrasound" else None
+        index = node.GetControlPointIndexByLabel(asked_for) if node is not None and asked_for else -1
+        if index >= 0:
+            self._framing.face(node.GetNthControlPointPositionWorld(index))
 
     def _show_ct(self) -> None:
         node = scene.find("CT")
