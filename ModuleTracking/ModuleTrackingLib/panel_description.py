@@ -69,6 +69,8 @@ PANEL = Panel(
             help="Set the tip into a divot that does not move and pivot the tool by 30° to all sides. "
             "To know its axis too, roll it about itself afterwards.",
             items=(
+                ReadOut("pivotAdvice", "Do now", large=True),
+                Picture("pivotCone", "Sides to which the tool was tilted, seen from above it"),
                 ParameterField("tool"),
                 ParameterField("pivot_s", "Pivot for"),
                 FileField("calibration_folder", "Kept in", folder=True),
@@ -76,8 +78,6 @@ PANEL = Panel(
                 Action("startSpin", "Roll", "Begin to collect poses of the tool rolled about itself, by 90° or more"),
                 Action("cancelPivot", "Cancel", "Forget the poses collected"),
                 ReadOut("pivotProgress", "Poses"),
-                ReadOut("pivotAdvice", "Do now", large=True),
-                Picture("pivotCone", "Sides to which the tool was tilted, seen from above it"),
                 ReadOut("calibration", "Tip"),
             ),
             status="calibrationStatus",
