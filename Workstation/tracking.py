@@ -66,7 +66,8 @@ def make_tracker(name: str, settings: list[str]) -> Tracker:
         Unknown plugin or parameter, or a value out of its limits.
     """
     plugin = TRACKERS.find(name)
-    return plugin(plugin.Settings.from_strings(_pairs(settings)))
+    nobody = {"hand": "round"} if name == "simulated" else {}  # nobody is here to hold the simulated tools
+    return plugin(plugin.Settings.from_strings({**nobody, **_pairs(settings)}))
 
 
 def make_device(name: str, settings: list[str]) -> AModeDevice:

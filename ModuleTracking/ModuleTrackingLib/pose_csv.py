@@ -30,67 +30,86 @@ class PoseRow:
     status: PoseStatus
     tool_to_tracker: Optional[Array]  # (4, 4) mm; None unless OK
     error_mm: float
+    quaternion: Optional[tuple[float, float, float, float]] = None  # scalar first, with the sign that the table gives it
 
 
 def read_pose_csv(path: str | Path) -> list[list[PoseRow]]:
-    """Frames in order of time; a frame is all rows of one time stamp.
+    """Frames in order of time; a frame is all rows of one time stamp. Columns may stand in any order, rows too.
 
     Raises
     ------
     InputError
-        Missing file, other columns, no row, or a row that cannot be read; the message gives its line.
+        Missing file or columns, no row, a row that cannot be read (the message gives its line), or a tool twice at one time.
     """
     path = Path(path)
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file)
-            header = [name.strip() for name in next(reader, [])]
-            if tuple(header) != COLUMNS:
-                raise InputError(f"{path}: not a pose table; its first line must be {','.join(COLUMNS)}")
-            rows = [_parse(path, reader.line_num, cells) for cells in reader if cells]
+            names = [name.strip() for name in next(reader, [])]
+            missing = [name for name in COLUMNS if name not in names]
+            if missing:
+                raise InputError(f"{path}: not a pose table; its first line must be {','.join(COLUMNS)}; missing: {missing[0]}")
+            order = [names.index(name) for name in COLUMNS]
+            rows = [_parse(path, reader.line_num, cells, order) for cells in reader if any(map(str.strip, cells))]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise InputError(f"{path}: cannot be read ({reason}); give a pose table (.csv)") from None
+        raise InputError(
+            f"{path}: cannot be read ({reason}); give a pose table (.csv) as `tracker record --csv` writes"
+        ) from None
     if not rows:
         raise InputError(f"{path}: holds no pose; record again")
-    frames: list[list[PoseRow]] = []
+    frames: dict[float, dict[str, PoseRow]] = {}
     for row in rows:
-        if frames and row.timestamp_s < frames[-1][0].timestamp_s:
-            raise InputError(f"{path}: time goes back at {row.timestamp_s} s; rows must be in order of time")
-        if frames and row.timestamp_s == frames[-1][0].timestamp_s:
-            frames[-1].append(row)
-        else:
-            frames.append([row])
-    return frames
+        frame = frames.setdefault(row.timestamp_s, {})
+        if row.tool in frame:
+            raise InputError(f"{path}: tool {row.tool!r} stands twice at {row.timestamp_s} s; leave one row of them out")
+        frame[row.tool] = row
+    return [list(frames[time_s].values()) for time_s in sorted(frames)]
 
 
-def _parse(path: Path, line: int, cells: list[str]) -> PoseRow:
-    if len(cells) != len(COLUMNS):
-        raise InputError(f"{path}, line {line}: {len(cells)} columns, expected {len(COLUMNS)}")
-    tool, status = cells[1].strip(), cells[2].strip().upper()
+def _parse(path: Path, line: int, cells: list[str], order: list[int]) -> PoseRow:
+    texts = [cells[index].strip() if index < len(cells) else "" for index in order]
+    tool, status = texts[1], texts[2].upper()
+    if status == "OK" and len(cells) <= max(order):  # a tool without pose needs no more columns
+        raise InputError(f"{path}, line {line}: {len(cells)} columns, expected {max(order) + 1}")
+    if not tool:
+        raise InputError(f"{path}, line {line}: no tool is named")
     try:
-        time, error = float(cells[0]), float(cells[10]) if cells[10].strip() else math.nan
+        time = _finite(float(texts[0]))
         if status != "OK":
             known = status in PoseStatus.__members__
-            return PoseRow(_finite(time), tool, PoseStatus(status) if known else PoseStatus.MISSING, None, math.nan)
-        quaternion, origin = np.array(cells[3:7], dtype=float), np.array(cells[7:10], dtype=float)
-        _finite(time, *quaternion, *origin)
+            return PoseRow(time, tool, PoseStatus(status) if known else PoseStatus.MISSING, None, math.nan)
+        error = float(texts[10]) if texts[10] else math.nan
+        w, x, y, z, *origin = (_finite(float(text)) for text in texts[3:10])
     except ValueError:
         raise InputError(
             f"{path}, line {line}: a number is missing or cannot be read; a tool without pose has status MISSING"
         ) from None
-    length = float(np.linalg.norm(quaternion))
+    length = math.sqrt(w * w + x * x + y * y + z * z)
     if abs(length - 1) > QUATERNION_TOLERANCE:
         raise InputError(f"{path}, line {line}: the quaternion has length {length:.3f}, expected 1")
-    if np.abs(origin).max() > LARGEST_COORDINATE_MM:
+    if max(map(abs, origin)) > LARGEST_COORDINATE_MM:
         raise InputError(f"{path}, line {line}: the tool is more than 100 m away; positions are expected in mm")
-    return PoseRow(time, tool, PoseStatus.OK, rigid(Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix(), origin), error)
+    quaternion = (w / length, x / length, y / length, z / length)
+    return PoseRow(time, tool, PoseStatus.OK, rigid(quaternion_matrix(quaternion), origin), error, quaternion)
 
 
-def _finite(*values: float) -> float:
-    if not all(math.isfinite(value) for value in values):
+def quaternion_matrix(quaternion: tuple[float, float, float, float]) -> Array:
+    """The rotation (3, 3) of a quaternion of length 1, scalar first."""
+    w, x, y, z = quaternion
+    return np.array(
+        (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        )
+    )
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
         raise ValueError("not finite")
-    return values[0]
+    return value
 
 
 class PoseCsvWriter:

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from ModuleTrackingLib.ndi.emulator.faults import FAULTS
 from ModuleTrackingLib.tracker import TRACKERS, PoseStatus
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals and signals")
@@ -99,6 +100,18 @@ def test_faults_reach_the_driver():
         assert {pose.status for pose in poses} == {PoseStatus.MISSING}
 
 
+def test_the_help_names_every_fault_and_the_options_are_heard(tmp_path):
+    from Workstation.commands.emulate import polaris
+
+    assert [name for name in FAULTS if name not in (polaris.__doc__ or "")] == []
+    link = tmp_path / "tracker"
+    options = ["--link", link, "--text-only", "--paced", "--seed", "3", "--keep-state", "--rate", "30"]
+    with emulate(*options) as (url, _), TRACKERS.create("polaris", port=url) as tracker:
+        assert url == str(link)
+        assert len(tracker.read()) == 4
+        assert tracker._poller.binary is False
+
+
 def test_the_tracker_command_probes_it():
     with emulate() as (url, _):
         done = subprocess.run(
@@ -117,7 +130,7 @@ def test_the_tracker_command_probes_it():
     [
         (["--fault", "gremlins"], "unknown fault 'gremlins'; known: byte-loss"),
         (["--rate", "0"], "1 to 1000 frames a second"),
-        (["--replay", "nowhere.csv"], "cannot read the pose CSV nowhere.csv"),
+        (["--replay", "nowhere.csv"], "nowhere.csv: cannot be read"),
     ],
 )
 def test_what_cannot_be_emulated_is_refused_in_one_line(arguments, message):

@@ -44,9 +44,9 @@ def test_a_tool_without_a_row_is_missing_in_that_frame(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "needs the columns"),
+        ("", "not a pose table"),
         ("timestamp_s,tool\n0,A\n", "missing: status"),
-        (HEAD, "holds no poses"),
+        (HEAD, "holds no pose"),
         (HEAD + "0,A,OK,1,0,0,0,1,2,,0\n", "line 2"),
         (HEAD + "0,A,OK,1,0,0,0,1,2,3,0\nx,A,OK,1,0,0,0,1,2,3,0\n", "line 3"),
         (HEAD + "0,A,OK,2,0,0,0,1,2,3,0\n", "line 2: the quaternion has length 2"),
@@ -60,7 +60,7 @@ def test_a_file_that_is_no_pose_file_is_refused_by_line(tmp_path, text, message)
 
 
 def test_a_file_that_is_not_there_is_refused():
-    with pytest.raises(InputError, match=r"cannot read the pose CSV nowhere\.csv"):
+    with pytest.raises(InputError, match=r"nowhere\.csv: cannot be read"):
         ReplayedMotion("nowhere.csv")
 
 

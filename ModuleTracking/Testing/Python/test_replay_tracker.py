@@ -7,10 +7,12 @@ import time
 import numpy as np
 import pytest
 from CranioNavLib.errors import InputError
+from CranioNavLib.rigid import rigid
 from CranioNavLib.sequence_metafile import RecordingWriter
 from ModuleTrackingLib.plugins.replay import ReplaySettings, ReplayTracker
 from ModuleTrackingLib.pose_csv import COLUMNS, PoseCsvWriter, read_pose_csv
 from ModuleTrackingLib.tracker import TRACKERS, PoseStatus, TrackerError
+from scipy.spatial.transform import Rotation
 from scripted_tracker import a_pose, missing, ok
 
 
@@ -147,7 +149,8 @@ HEAD = ",".join(COLUMNS) + "\n"
         (HEAD + "0,Probe,OK,1,0,0,0,1,2,nan,0\n", "line 2: a number is missing"),
         (HEAD + "0,Probe,OK,1,1,0,0,1,2,3,0\n", "quaternion has length 1.414"),
         (HEAD + "0,Probe,OK,1,0,0,0,1,2,3e8,0\n", "more than 100 m away"),
-        (HEAD + "1,Probe,OK,1,0,0,0,1,2,3,0\n0,Probe,OK,1,0,0,0,1,2,3,0\n", "time goes back at 0.0 s"),
+        (HEAD + "1,Probe,OK,1,0,0,0,1,2,3,0\n1,Probe,MISSING\n", "'Probe' stands twice at 1.0 s"),
+        (HEAD + "1,,OK,1,0,0,0,1,2,3,0\n", "line 2: no tool is named"),
         ("\x00\x01", "its first line must be|cannot be read"),
     ],
 )
@@ -155,6 +158,19 @@ def test_a_damaged_pose_table_is_refused_by_name(tmp_path, text, message):
     (tmp_path / "p.csv").write_text(text)
     with pytest.raises(InputError, match=message):
         read_pose_csv(tmp_path / "p.csv")
+
+
+def test_rows_columns_and_blanks_may_stand_in_any_order(tmp_path):
+    lines = ["tool, timestamp_s,status,error_mm,tx_mm,ty_mm,tz_mm,qw,qx,qy,qz,note"]
+    lines += ["B,1.5,OK,,1,2,3,0,0,0,-1,held", "", "A,0.5,missing", "B,0.5,OK,0.2,4,5,6,0.5,0.5,-0.5,0.5,", "A,1.5,OUT_OF_VOLUME"]
+    (tmp_path / "p.csv").write_text("\ufeff" + "\r\n".join(lines), encoding="utf-8")
+    first, second = read_pose_csv(tmp_path / "p.csv")
+    assert [(row.tool, row.timestamp_s, row.status.value) for row in first] == [("A", 0.5, "MISSING"), ("B", 0.5, "OK")]
+    assert {row.tool: row.status.value for row in second} == {"A": "OUT_OF_VOLUME", "B": "OK"}
+    pose = {row.tool: row for row in first}["B"]
+    turn = Rotation.from_quat([0.5, -0.5, 0.5, 0.5]).as_matrix()
+    np.testing.assert_allclose(pose.tool_to_tracker, rigid(turn, [4, 5, 6]), atol=1e-12)
+    assert (pose.quaternion, pose.error_mm) == ((0.5, 0.5, -0.5, 0.5), 0.2)
 
 
 def test_a_missing_pose_table_is_refused(tmp_path):

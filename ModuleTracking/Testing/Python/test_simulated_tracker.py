@@ -33,6 +33,18 @@ def test_it_lists_its_tools_and_gives_every_one_in_each_frame(a_session):
     assert 900 < frame["Reference"].tool_to_tracker[2, 3] < 1900
 
 
+def test_a_hand_that_goes_round_shows_every_tool_and_stays_on_the_head(a_session):
+    with TRACKERS.create("simulated", hand="round") as tracker:
+        frames = [{pose.tool: pose for pose in tracker.read()} for _ in range(600)]  # half a minute
+    for tool in ("Probe", "Stylus", "Sphere"):
+        assert {frame[tool].status for frame in frames} == {PoseStatus.OK}
+        tips = np.array(
+            [(invert_rigid(frame["Reference"].tool_to_tracker) @ frame[tool].tool_to_tracker)[:3, 3] for frame in frames]
+        )
+        assert np.ptp(tips, axis=0).max() > 30  # from place to place
+        assert np.linalg.norm(np.diff(tips, axis=0), axis=1).max() * 20 < 1000  # mm/s: never a jump
+
+
 def test_frames_come_at_the_rate_and_carry_the_hosts_time(a_session):
     with TRACKERS.create("simulated", rate_hz="50") as tracker:
         frames = [tracker.read()[0] for _ in range(100)]

@@ -178,6 +178,12 @@ class SimulatedSession:
         with self._lock:
             self._script = sorted([*self._script, *((now + delay, what) for delay, what in steps)], key=lambda step: step[0])
 
+    @property
+    def playing(self) -> bool:
+        """Whether things are still to be done by themselves."""
+        with self._lock:
+            return bool(self._script)
+
     def palpate_plan(self, dwell_s: float = 3.0) -> float:
         """Palpate all points of the plan one after another, by itself. Returns how long it will take, s."""
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import bisect
-import csv
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Optional, Protocol
 
@@ -13,8 +11,7 @@ import numpy as np
 from CranioNavLib.errors import InputError
 
 from ModuleTrackingLib.ndi.tracking import RawPose
-
-COLUMNS = ("timestamp_s", "tool", "status", "qw", "qx", "qy", "qz", "tx_mm", "ty_mm", "tz_mm", "error_mm")
+from ModuleTrackingLib.pose_csv import PoseRow, read_pose_csv
 
 
 class Motion(Protocol):
@@ -56,13 +53,6 @@ class HandMotion:
         return RawPose((math.cos(angle), float(vector[0]), float(vector[1]), float(vector[2])), (x, y, z), 0.1 + 0.02 * index)
 
 
-@dataclass(frozen=True)
-class _Row:
-    time_s: float
-    tool: str
-    pose: Optional[RawPose]
-
-
 class ReplayedMotion:
     """Poses from a CSV file, each shown exactly as it stands there until the next one's time, in a loop.
 
@@ -71,16 +61,14 @@ class ReplayedMotion:
     """
 
     def __init__(self, path: str | Path) -> None:
-        rows = _read_rows(Path(path))
-        self.tools = tuple(dict.fromkeys(row.tool for row in rows))
-        times = sorted({row.time_s for row in rows})
+        frames = read_pose_csv(path)
+        self.tools = tuple(dict.fromkeys(row.tool for frame in frames for row in frame))
+        times = [frame[0].timestamp_s for frame in frames]
         steps = np.diff(times)
         self.rate_hz = float(1.0 / np.median(steps)) if len(steps) else 60.0
         self._times = [time - times[0] for time in times]
-        frames: dict[float, dict[str, Optional[RawPose]]] = {time: dict.fromkeys(self.tools) for time in times}
-        for row in rows:
-            frames[row.time_s][row.tool] = row.pose
-        self._frames = [frames[time] for time in times]
+        nowhere: dict[str, Optional[RawPose]] = dict.fromkeys(self.tools)
+        self._frames = [{**nowhere, **{row.tool: _raw(row) for row in frame}} for frame in frames]
         self._numbers = [0]
         for time in self._times[1:]:
             self._numbers.append(max(self._numbers[-1] + 1, round(time * self.rate_hz)))
@@ -93,41 +81,8 @@ class ReplayedMotion:
         return int(loops) * (self._numbers[-1] + 1) + self._numbers[index], self._frames[index]
 
 
-def _read_rows(path: Path) -> list[_Row]:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            table = csv.DictReader(file)
-            missing = [name for name in COLUMNS if name not in (table.fieldnames or ())]
-            if missing:
-                raise InputError(f"{path}: a pose CSV needs the columns {', '.join(COLUMNS)}; missing: {', '.join(missing)}")
-            rows = [_row(path, number, fields) for number, fields in enumerate(table, start=2)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"cannot read the pose CSV {path}: {error}; give a file that `tracker record --csv` wrote") from None
-    if not rows:
-        raise InputError(f"{path} holds no poses; record some first")
-    return rows
-
-
-def _row(path: Path, line: int, fields: dict[str, Optional[str]]) -> _Row:
-    try:
-        time_s, tool, status = (
-            float(fields["timestamp_s"] or ""),
-            (fields["tool"] or "").strip(),
-            (fields["status"] or "").strip(),
-        )
-        if not math.isfinite(time_s) or not tool:
-            raise ValueError("no time or no tool")
-        if status != "OK":
-            return _Row(time_s, tool, None)
-        qw, qx, qy, qz, x, y, z = (float(fields[name] or "") for name in COLUMNS[3:10])
-        error = float(fields["error_mm"] or 0.0)
-    except ValueError as problem:
-        raise InputError(f"{path}, line {line}: {problem}; expected {','.join(COLUMNS)}") from None
-    length = math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
-    if not all(map(math.isfinite, (x, y, z, length))) or abs(length - 1.0) > 0.01:
-        raise InputError(f"{path}, line {line}: the quaternion has length {length:.4g}, expected 1, and finite coordinates")
-    return _Row(
-        time_s,
-        tool,
-        RawPose((qw / length, qx / length, qy / length, qz / length), (x, y, z), error if math.isfinite(error) else 0.0),
-    )
+def _raw(row: PoseRow) -> Optional[RawPose]:
+    if row.tool_to_tracker is None or row.quaternion is None:
+        return None
+    x, y, z = (float(value) for value in row.tool_to_tracker[:3, 3])
+    return RawPose(row.quaternion, (x, y, z), row.error_mm if math.isfinite(row.error_mm) else 0.0)
