@@ -66,8 +66,9 @@ def make_tracker(name: str, settings: list[str]) -> Tracker:
         Unknown plugin or parameter, or a value out of its limits.
     """
     plugin = TRACKERS.find(name)
-    nobody = {"hand": "round"} if name == "simulated" else {}  # nobody is here to hold the simulated tools
-    return plugin(plugin.Settings.from_strings({**nobody, **_pairs(settings)}))
+    # Nobody is here to hold the simulated tools, and their tracking needs no CT.
+    alone = {"hand": "round", "head": "synthetic"} if name == "simulated" else {}
+    return plugin(plugin.Settings.from_strings({**alone, **_pairs(settings)}))
 
 
 def make_device(name: str, settings: list[str]) -> AModeDevice:
