@@ -58,6 +58,7 @@ def _coarse(surface: Any) -> Any:
     coarse = vtkBinnedDecimation()
     coarse.SetInputData(surface)
     coarse.SetNumberOfDivisions(*DIVISIONS)
+    coarse.SetPointGenerationModeToBinAverages()  # one of its input points would make the surface rough
     smooth = vtkPolyDataNormals()
     smooth.SetInputConnection(coarse.GetOutputPort())
     smooth.SplittingOff()

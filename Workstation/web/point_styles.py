@@ -31,7 +31,7 @@ STYLES = {
     "RegisteredPoints": PointStyle(3.5, "Sphere3D", ("ultrasound", "verification")),
     "PlausibilityPoints": PointStyle(4.0, "Square2D", ("verification",)),
 }
-ASKED_FOR = (1.0, 0.85, 0.2)  # the point to place, touch or palpate now
+ASKED_FOR = (0.9, 0.25, 0.0)  # Okabe and Ito's vermilion, a little stronger: the point to place, touch or palpate now
 MARKED = ("LandmarksCT", "ProtocolPoints")  # lists of which one point is asked for
 
 
