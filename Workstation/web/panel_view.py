@@ -26,7 +26,7 @@ from trame.widgets import vuetify3 as v3
 from Workstation.web.panel_state import choices_of, panel_state, parse, translated
 
 Translation = Callable[[str], str]
-OF_THE_SESSION = ("recording_path", "output_folder")  # the session fills these in
+OF_THE_SESSION = ("recording_path", "output_folder", "calibration_folder")  # the session fills these in
 
 # Okabe and Ito's colours, which the colour-blind tell apart; a sign stands beside each.
 COLORS = "({ good: '#2fbf8f', warning: '#f0b429', bad: '#ff7b5c', plain: undefined })"

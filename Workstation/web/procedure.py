@@ -35,6 +35,6 @@ PROCEDURE: tuple[ProcedureStep, ...] = (
         ),
     ),
     ProcedureStep("verification", "Verification", ((HAND, "targets"), (REGISTRATION, "verification"))),
-    ProcedureStep("navigation", "Navigation", ((HAND, "tour"), (NAVIGATION, "navigation"))),
+    ProcedureStep("navigation", "Navigation", ((NAVIGATION, "navigation"), (HAND, "tour"))),
     ProcedureStep("report", "Report and export", ((SESSION, "report"),)),
 )
