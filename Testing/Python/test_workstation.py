@@ -31,21 +31,6 @@ def pictures() -> Path:
     return folder
 
 
-def digitise_landmarks(user: User) -> None:
-    """Let the hand touch each landmark and read it, as the screen says."""
-    for number in range(4):
-        asked = user.reading("landmarks", "nextPoint")
-        user.press("landmarks", "touchNextLandmark")
-        user.sees("landmarks", "the stylus goes to")
-        for _ in range(10):  # a hand on its way is refused, in words; then one tries again
-            user.page.wait_for_timeout(2500)
-            user.press("landmarks", "digitise")
-            user.page.wait_for_timeout(700)
-            if user.reading("landmarks", "nextPoint") != asked:
-                break
-        assert user.reading("landmarks", "nextPoint") != asked, f"landmark {number + 1} is not read"
-
-
 @needs_browser
 @pytest.mark.slow
 def test_the_whole_procedure_is_done_by_clicks(tmp_path, pictures):
@@ -73,7 +58,7 @@ def test_the_whole_procedure_is_done_by_clicks(tmp_path, pictures):
         user.sees("calibration", r"SD \d+\.\d+ mm")
         user.picture("4-calibration")
         user.next("calibration")
-        digitise_landmarks(user)
+        user.digitise_landmarks()
         user.press("landmarks", "registerLandmarks")
         user.sees("landmarks", r"4 landmark pairs, FRE \d")
         user.picture("5-landmarks")

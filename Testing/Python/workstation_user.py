@@ -72,6 +72,20 @@ class User:
         """What a read-out shows."""
         return str(self.page.locator(f"[data-panel={step}] [data-reading={name}]").first.inner_text())
 
+    def digitise_landmarks(self) -> None:
+        """Let the simulated hand touch each landmark and read it, as the screen says."""
+        for number in range(4):
+            asked = self.reading("landmarks", "nextPoint")
+            self.press("landmarks", "touchNextLandmark")
+            self.sees("landmarks", "the stylus goes to")
+            for _ in range(10):  # a hand on its way is refused, in words; then one tries again
+                self.page.wait_for_timeout(2500)
+                self.press("landmarks", "digitise")
+                self.page.wait_for_timeout(700)
+                if self.reading("landmarks", "nextPoint") != asked:
+                    break
+            assert self.reading("landmarks", "nextPoint") != asked, f"landmark {number + 1} is not read"
+
     def picture(self, name: str) -> None:
         """Keep pictures of the page in the two sizes that it has to fit."""
         if self._pictures is None:

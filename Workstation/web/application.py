@@ -29,9 +29,9 @@ from Workstation.web.tool_models import registered
 from Workstation.web.view_controls import ViewControls, layout_grid
 from Workstation.web.views import ViewFollower
 
-POLL_S = 0.04  # devices: at least 20 updates a second reach the views
-REFRESH_EVERY = 5  # polls between two looks at the read-outs
-SAVE_EVERY = 25  # polls between two looks at what is to be saved
+POLL_S = 0.02  # a pose waits for half of it on average
+REFRESH_EVERY = 8  # polls between two looks at the read-outs
+SAVE_EVERY = 50  # polls between two looks at what is to be saved
 PICTURE_QUALITY = 90  # JPEG; one quality for moving and still pictures, so that none is sent twice
 LOG = logging.getLogger(__name__)
 
@@ -68,6 +68,7 @@ class WorkstationApp(TrameApp):
         )
         self.page = Page(self.server, self.panels, self.layouts, PROCEDURE)
         self.server.controller.on_server_ready.add_task(self._keep_fresh)
+        self.server.controller.on_server_ready.add_task(self.painter.run)
 
     @property
     def ui(self) -> Any:
@@ -83,7 +84,8 @@ class WorkstationApp(TrameApp):
     def _make_views(self) -> None:
         from trame_slicer.core import LayoutManager, SlicerApp
 
-        from Workstation.web.pacing import pace, register_quiet_factories
+        from Workstation.web.moving import MovingPicture
+        from Workstation.web.pacing import Painter, pace, register_quiet_factories
 
         self.slicer = SlicerApp()
         host.adopt_scene(self.slicer.scene, self.slicer.app_logic)
@@ -92,7 +94,10 @@ class WorkstationApp(TrameApp):
         # the views are made here: made inside the page, their widgets would land between the page's own
         self.layouts.register_layout_dict(layout_grid())
         self.layouts.set_layout("four")
-        self.budget = pace(self.slicer.view_manager.get_views())
+        self.painter = Painter()
+        paced = pace(self.slicer.view_manager.get_views(), self.painter, PICTURE_QUALITY)
+        for view in self.slicer.view_manager.get_threed_views():
+            paced[view.get_view_node_id()].draw_with(MovingPicture(view, lambda: self.views.moving_models()))
 
     def _use_folder(self) -> None:
         """The modules write into the session's folder unless the user says otherwise."""
@@ -112,10 +117,11 @@ class WorkstationApp(TrameApp):
         for turn in itertools.count():
             await asyncio.sleep(POLL_S)
             self._poll()
-            try:
-                self._turn(turn)
-            except Exception:  # a read-out's defect must not end tracking
-                LOG.exception("the page could not be brought up to date")
+            for part in (self._move, self._turn, self._keep):
+                try:
+                    part(turn)
+                except Exception:  # a read-out's defect must not end tracking
+                    LOG.exception("the page could not be brought up to date")
 
     def _draw_again(self, area: str) -> None:
         """Send the picture of a view, or of all, to a window that has none yet."""
@@ -125,15 +131,20 @@ class WorkstationApp(TrameApp):
 
     def _poll(self) -> None:
         """Take over what the devices have to say. Not drawn while a tool's place in the CT is not known."""
-        self.budget.muted = not registered()
+        self.painter.muted = not registered()
         for name in (TRACKING, ULTRASOUND, HAND):
-            with contextlib.suppress(InputError):  # the logic keeps the reason and its panel shows it
+            moving = self.painter.while_moving() if name == TRACKING else contextlib.nullcontext()
+            with moving, contextlib.suppress(InputError):  # the logic keeps the reason and its panel shows it
                 self.logics[name].poll()
-        self.budget.muted = False
+        self.painter.muted = False
+
+    def _move(self, turn: int) -> None:
+        """Let the views follow the tool, as soon as what was there before is painted."""
+        if self.server.state.step == "navigation" and self.painter.idle:
+            with self.painter.while_moving():
+                self._navigate()
 
     def _turn(self, turn: int) -> None:
-        if turn % 2 == 0 and self.server.state.step == "navigation":
-            self._navigate()
         if turn % REFRESH_EVERY == 0:
             with self.server.state as state:
                 self._refresh_views(state)
@@ -143,6 +154,9 @@ class WorkstationApp(TrameApp):
                 state.simulated = self._is_simulated()
             for panel in self.panels.values():
                 panel.refresh()
+
+    def _keep(self, turn: int) -> None:
+        """Save what is new; let go of windows that take nothing."""
         if turn % SAVE_EVERY == 0:
             self._save()
             self.windows.drop_stalled()

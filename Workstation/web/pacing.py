@@ -1,9 +1,12 @@
-"""Renders no more often than the machine can afford, so that devices and clicks are served between the pictures."""
+"""Paints the views in turn, no more often than the machine can afford, so that devices and clicks are served in between."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -12,70 +15,99 @@ from trame_slicer.views import ScheduledRenderStrategy, SliceView, ThreeDView, V
 
 from Workstation.web.view_frame import slice_frame, threed_frame
 
-FASTEST_S = 1 / 25  # between two pictures of one view
-SHARE = 0.4  # of the event loop's time, for the rendering of all views together
+FASTEST_S = 1 / 30  # between two pictures of one view
+SHARE = 0.8  # of the event loop's time that painting may take while there is always something to paint
+MOST_ENCODING = 2  # pictures of one view on their way; a further one would only be older when it arrives
+LOG = logging.getLogger(__name__)
 
 
-class RenderBudget:
-    """How long the views take to render, and how long each has to wait before its next picture."""
+class Painter:
+    """Paints the views that have asked for it, one at a time, the one that has waited longest first."""
 
     def __init__(self) -> None:
-        self._lasted_s: dict[int, float] = {}
         self.muted = False  # requests are dropped: what changes now is not drawn
+        self.moving = False  # requests come from tools that move; all else stands still
+        self._wanted: dict[str, PacedRendering] = {}
+        self._news: asyncio.Event | None = None
 
-    def note(self, view: Any, seconds: float) -> None:
-        """A view has rendered."""
-        before = self._lasted_s.get(id(view), seconds)
-        self._lasted_s[id(view)] = 0.7 * before + 0.3 * seconds
+    @contextmanager
+    def while_moving(self) -> Iterator[None]:
+        """Requests within come from tools that move: views that keep a picture of what stands still may use it."""
+        self.moving = True
+        try:
+            yield
+        finally:
+            self.moving = False
 
     @property
-    def period_s(self) -> float:
-        """Between two pictures of one view."""
-        return max(FASTEST_S, sum(self._lasted_s.values()) / SHARE)
+    def idle(self) -> bool:
+        """Whether everything that was asked for is painted."""
+        return not self._wanted
+
+    def ask(self, name: str, view: PacedRendering) -> None:
+        """A view wants to be painted."""
+        self._wanted.setdefault(name, view)
+        if self._news is not None:
+            self._news.set()
+
+    async def run(self, **_: Any) -> None:
+        """Paint for ever. In the server's event loop."""
+        self._news = asyncio.Event()
+        while True:
+            ready = [(view.last_s, name) for name, view in self._wanted.items() if view.can_take_one()]
+            if not ready:
+                self._news.clear()
+                pause = FASTEST_S if self._wanted else None
+                with suppress(asyncio.TimeoutError):
+                    await asyncio.wait_for(self._news.wait(), pause)
+                continue
+            last_s, name = min(ready)
+            too_early_s = last_s + FASTEST_S - time.monotonic()
+            if too_early_s > 0:
+                await asyncio.sleep(too_early_s)
+                continue  # another view may have been asked for that has waited longer
+            await asyncio.sleep(self._paint(self._wanted.pop(name)))
+
+    def _paint(self, view: PacedRendering) -> float:
+        """Returns for how long to let others work."""
+        begun = time.monotonic()
+        try:
+            view.paint()
+        except Exception:  # one view's defect must not stop the others
+            LOG.exception("a view could not be painted")
+        return (time.monotonic() - begun) * (1 / SHARE - 1)
 
 
-class PacedRendering(ScheduledRenderStrategy):
-    """Gathers the requests of a period into one picture, made by the strategy given."""
+class PacedRendering(ScheduledRenderStrategy):  # type: ignore[misc]
+    """A view's requests go to the painter; `scheduler` (trame-rca's) renders, encodes and sends one picture."""
 
-    def __init__(self, inner: ScheduledRenderStrategy, budget: RenderBudget) -> None:
+    def __init__(self, name: str, scheduler: Any, painter: Painter, quality: int) -> None:
         super().__init__()
-        self._inner, self._budget = inner, budget
-        self._pending: asyncio.TimerHandle | None = None
-        self._last_s = self._begun_s = 0.0
+        self._name, self._scheduler, self._painter, self._quality = name, scheduler, painter, quality
+        self.last_s = 0.0
+        self.changed: Callable[[], None] = bool  # called when more than a moving tool has changed
+        scheduler.schedule_render = self.schedule_render  # of its own accord it renders when the page resizes the view
 
-    def set_abstract_view(self, abstract_view: Any) -> None:
-        """Whose pictures they are."""
-        super().set_abstract_view(abstract_view)
-        self._inner.set_abstract_view(abstract_view)
-        window = abstract_view.render_window()
-        window.AddObserver("StartEvent", self._begin)
-        window.AddObserver("EndEvent", self._end)
+    def draw_with(self, pictures: Any) -> None:
+        """Let another object make the pictures (its `img_cols_rows`); it is told when more than a moving tool has changed."""
+        self._scheduler._rca, self.changed = pictures, pictures.forget
 
     def schedule_render(self) -> None:
-        """Ask for a picture, now or when the period is over."""
-        if self._pending is not None or self._budget.muted:
+        """Ask for a picture."""
+        if self._painter.muted:
             return
-        try:
-            loop = asyncio.get_running_loop()
-        except RuntimeError:  # while the application is built there is nobody to look
-            self._inner.schedule_render()
-            return
-        wait_s = max(0.0, self._last_s + self._budget.period_s - time.monotonic())
-        self._pending = loop.call_later(wait_s, self._fire)
+        if not self._painter.moving:
+            self.changed()
+        self._painter.ask(self._name, self)
 
-    def did_render(self) -> None:
-        """A picture was made."""
-        self._inner.did_render()
+    def can_take_one(self) -> bool:
+        """Whether the pictures before are on their way."""
+        return bool(self._scheduler._push_queue.qsize() < MOST_ENCODING)
 
-    def _fire(self) -> None:
-        self._pending, self._last_s = None, time.monotonic()
-        self._inner.schedule_render()
-
-    def _begin(self, *_: Any) -> None:
-        self._begun_s = time.monotonic()
-
-    def _end(self, *_: Any) -> None:
-        self._budget.note(self.abstract_view, time.monotonic() - self._begun_s)
+    def paint(self) -> None:
+        """Render, and have the picture encoded and sent."""
+        self.last_s = time.monotonic()
+        self._scheduler._render_frame(self._quality)
 
 
 def register_quiet_factories(view_manager: Any, server: Any, quality: int) -> None:
@@ -86,16 +118,16 @@ def register_quiet_factories(view_manager: Any, server: Any, quality: int) -> No
     ):
         quiet = partial(kind, scheduled_render_strategy=ScheduledRenderStrategy())
         view_manager.register_factory(
-            RemoteViewFactory(
-                server, quiet, view_type, populate_view_ui_f=controls, target_fps=30.0, blur_fps=10.0, interactive_quality=quality
-            )
+            RemoteViewFactory(server, quiet, view_type, populate_view_ui_f=controls, interactive_quality=quality)
         )
 
 
-def pace(views: list[Any]) -> RenderBudget:
-    """Let all views share one budget; costly smoothing of edges is left out, as there is no graphics card to do it."""
-    budget = RenderBudget()
+def pace(views: list[Any], painter: Painter, quality: int) -> dict[str, PacedRendering]:
+    """Let one painter paint all views; costly smoothing of edges is left out, as there is no graphics card to do it."""
+    paced = {}
     for view in views:
         view.render_window().SetMultiSamples(0)
-        view.set_scheduled_render(PacedRendering(view._scheduled_render, budget))
-    return budget
+        name = view.get_view_node_id()
+        paced[name] = PacedRendering(name, view._scheduled_render._scheduler, painter, quality)
+        view.set_scheduled_render(paced[name])
+    return paced

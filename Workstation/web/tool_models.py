@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from CranioNavLib import scene, scene_data
+from CranioNavLib import host, scene, scene_data
 
 from Workstation.web.drawn_models import new_model
 
@@ -27,13 +27,17 @@ class ToolModels:
         for tool in TOOLS:
             self._show(tool, forerun_mm if tool == "Probe" else 0.0)
 
+    def nodes(self) -> list[Any]:
+        """The models' nodes."""
+        return [node for node in self._models.values() if node.GetScene() is not None]
+
     def _show(self, tool: str, forerun_mm: float) -> None:
         visible = scene_data.get_pose(f"{tool}ToReference").matrix is not None and registered()
         node = self._models.get(tool)
         if node is None or node.GetScene() is None:
             if not visible:
                 return
-            node = self._models[tool] = new_model(f"{tool} model", TOOLS[tool])
+            node = self._models[tool] = moving_model(f"{tool} model", TOOLS[tool])
             node.SetAndObserveTransformNodeID(scene.find(f"{tool}ToReference").GetID())
         if node.GetPolyData() is None or self._foreruns.get(tool) != forerun_mm:
             node.SetAndObservePolyData(tool_shape(*SHAPES[tool], forerun_mm))
@@ -48,6 +52,10 @@ class ErrorRing:
     def __init__(self) -> None:
         self._node: Any = None
 
+    def nodes(self) -> list[Any]:
+        """The ring's node, if there is one."""
+        return [self._node] if self._node is not None and self._node.GetScene() is not None else []
+
     def show(self, tip_ras_mm: Any, radius_mm: float | None) -> None:
         """Move and size it; without a radius it is hidden."""
         from vtkmodules.vtkFiltersSources import vtkSphereSource
@@ -59,7 +67,7 @@ class ErrorRing:
                 self._node.GetDisplayNode().SetVisibility(False)
             return
         if self._node is None:
-            self._node = new_model("Error ring", RING)
+            self._node = moving_model("Error ring", RING)
             self._node.GetDisplayNode().SetRepresentation(self._node.GetDisplayNode().WireframeRepresentation)
             self._node.GetDisplayNode().SetVisibility2D(True)
             self._node.GetDisplayNode().SetSliceIntersectionThickness(3)
@@ -71,6 +79,14 @@ class ErrorRing:
         source.Update()
         self._node.SetAndObservePolyData(source.GetOutput())
         self._node.GetDisplayNode().SetVisibility(True)
+
+
+def moving_model(name: str, color: tuple[float, float, float]) -> Any:
+    """A model that moves with every pose: the slices draw it themselves, the 3-D view gets it from moving.MovingPicture."""
+    node = new_model(name, color)
+    for index in range(host.scene().GetNumberOfNodesByClass("vtkMRMLSliceNode")):
+        node.GetDisplayNode().AddViewNodeID(host.scene().GetNthNodeByClass(index, "vtkMRMLSliceNode").GetID())
+    return node
 
 
 def registered() -> bool:

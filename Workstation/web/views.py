@@ -68,6 +68,10 @@ class ViewFollower:
             self._framing.fit_slices()
         self._zoomed = zoom
 
+    def moving_models(self) -> list[Any]:
+        """Nodes of what moves with every pose."""
+        return [*self._tools.nodes(), *self._ring.nodes()]
+
     def ring(self, tip_ras_mm: Any, radius_mm: float | None) -> None:
         """The 95% error about a point; without a radius none."""
         self._ring.show(tip_ras_mm, radius_mm)

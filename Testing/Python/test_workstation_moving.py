@@ -1,0 +1,203 @@
+"""What moves is drawn over a kept picture: it must look as if all had been drawn anew."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from vtkmodules.vtkFiltersSources import vtkConeSource, vtkSphereSource
+from vtkmodules.vtkRenderingCore import vtkActor, vtkPolyDataMapper, vtkRenderer, vtkRenderWindow, vtkRenderWindowInteractor
+
+from Workstation.web.moving import MovingPicture
+from Workstation.web.pacing import PacedRendering, Painter
+
+
+def actor_of(mesh: Any, color: tuple[float, float, float]) -> Any:
+    mapper, actor = vtkPolyDataMapper(), vtkActor()
+    mapper.SetInputData(mesh)
+    actor.SetMapper(mapper)
+    actor.GetProperty().SetColor(*color)
+    return actor
+
+
+def mesh_of(source: Any) -> Any:
+    source.Update()
+    return source.GetOutput()
+
+
+class View:
+    """A 3-D view with a skull of a kind."""
+
+    def __init__(self) -> None:
+        self._window, self._renderer = vtkRenderWindow(), vtkRenderer()
+        self._window.SetOffScreenRendering(1)
+        self._window.SetMultiSamples(0)
+        self._window.SetSize(200, 160)
+        self._window.AddRenderer(self._renderer)
+        self._interactor = vtkRenderWindowInteractor()
+        self._interactor.SetRenderWindow(self._window)
+        self.rendered = 0
+        self._window.AddObserver("EndEvent", self._count)
+        sphere = vtkSphereSource()
+        sphere.SetRadius(60)
+        sphere.SetThetaResolution(60)
+        sphere.SetPhiResolution(60)
+        self.skull = actor_of(mesh_of(sphere), (0.9, 0.9, 0.8))
+        self._renderer.AddActor(self.skull)
+        self._renderer.ResetCamera()
+
+    def _count(self, *_: Any) -> None:
+        self.rendered += 1
+
+    def render_window(self) -> Any:
+        return self._window
+
+    def renderer(self) -> Any:
+        return self._renderer
+
+
+class Tool:
+    """A model node of a tool."""
+
+    def __init__(self, x: float, y: float, z: float) -> None:
+        cone = vtkConeSource()
+        cone.SetHeight(50)
+        cone.SetRadius(12)
+        cone.SetCenter(x, y, z)
+        self.mesh, self.visible = mesh_of(cone), True
+
+    def GetDisplayNode(self) -> Any:
+        return SimpleNamespace(
+            GetVisibility=lambda: self.visible,
+            GetColor=lambda: (0.9, 0.6, 0.0),
+            GetOpacity=lambda: 1.0,
+            GetRepresentation=lambda: 2,
+        )
+
+    def GetPolyData(self) -> Any:
+        return self.mesh
+
+    def GetID(self) -> str:
+        return "tool"
+
+    def GetParentTransformNode(self) -> None:
+        return None
+
+
+def drawn_anew(tool: Tool) -> Any:
+    """The truth: skull and tool in one renderer."""
+    view = View()
+    camera = view.renderer().GetActiveCamera().__class__()
+    camera.DeepCopy(view.renderer().GetActiveCamera())
+    view.renderer().AddActor(actor_of(tool.mesh, (0.9, 0.6, 0.0)))
+    view.renderer().SetActiveCamera(camera)
+    view.renderer().ResetCameraClippingRange()
+    return MovingPicture(view, list).img_cols_rows[0].astype(int)
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 80.0), (55.0, 10.0, 0.0), (0.0, 0.0, -80.0), (40.0, 40.0, 40.0)])
+def test_a_tool_before_in_and_behind_the_skull_looks_as_if_drawn_with_it(place):
+    tool, view = Tool(*place), View()
+    picture, height, width = MovingPicture(view, lambda: [tool]).img_cols_rows
+    assert (height, width) == (160, 200)
+    differs = np.abs(picture.astype(int) - drawn_anew(tool)).max(axis=2) > 40
+    assert differs.mean() < 0.005
+
+
+def test_a_tool_that_moves_leaves_the_rest_undrawn():
+    tool, view = Tool(0, 0, 80), View()
+    pictures = MovingPicture(view, lambda: [tool])
+    first = pictures.img_cols_rows[0]
+    tool.mesh = Tool(30, 0, 80).mesh
+    assert (pictures.img_cols_rows[0] != first).any()
+    assert view.rendered == 1
+    view.renderer().GetActiveCamera().Azimuth(30)
+    pictures.img_cols_rows  # noqa: B018
+    assert view.rendered == 2
+    view.skull.GetProperty().SetColor(1.0, 0.0, 0.0)
+    assert pictures.img_cols_rows[0].max() == 255
+    assert view.rendered == 3
+    tool.visible = False
+    pictures.img_cols_rows  # noqa: B018
+    assert view.rendered == 4
+    pictures.forget()
+    pictures.img_cols_rows  # noqa: B018
+    assert view.rendered == 5
+
+
+class Scheduler:
+    """Stands in for trame-rca's."""
+
+    def __init__(self, name: str, painted: list[str]) -> None:
+        self.name, self.painted, self._push_queue = name, painted, asyncio.Queue()
+
+    def _render_frame(self, quality: int) -> None:
+        self.painted.append(self.name)
+
+
+def painted_of(ask: Any, seconds: float = 0.2) -> list[str]:
+    """What is painted while `ask(views, painter)` runs and a little longer."""
+    painted: list[str] = []
+
+    async def run() -> None:
+        painter = Painter()
+        views = {name: PacedRendering(name, Scheduler(name, painted), painter, 90) for name in "abc"}
+        task = asyncio.create_task(painter.run())
+        await asyncio.sleep(0)
+        await ask(views, painter)
+        await asyncio.sleep(seconds)
+        task.cancel()
+
+    asyncio.run(run())
+    return painted
+
+
+def test_many_requests_become_one_picture():
+    async def ask(views: Any, _: Any) -> None:
+        for _ in range(100):
+            views["a"].schedule_render()
+
+    assert painted_of(ask) == ["a"]
+
+
+def test_a_busy_view_does_not_keep_the_others_from_being_painted():
+    async def ask(views: Any, _: Any) -> None:
+        for _ in range(40):
+            for name in "abc":
+                views[name].schedule_render()
+            await asyncio.sleep(0.005)
+
+    painted = painted_of(ask)
+    counts = [painted.count(name) for name in "abc"]
+    assert max(counts) - min(counts) <= 1
+    assert min(counts) >= 2
+
+
+def test_nothing_is_painted_for_what_is_not_to_be_seen_or_cannot_be_sent():
+    async def ask(views: Any, painter: Any) -> None:
+        painter.muted = True
+        views["a"].schedule_render()
+        painter.muted = False
+        for _ in range(2):
+            views["b"]._scheduler._push_queue.put_nowait(None)
+        views["b"].schedule_render()
+        views["c"].schedule_render()
+
+    assert painted_of(ask) == ["c"]
+
+
+def test_only_what_stands_still_makes_a_kept_picture_old():
+    forgotten = []
+
+    async def ask(views: Any, painter: Any) -> None:
+        views["a"].draw_with(SimpleNamespace(forget=lambda: forgotten.append("a")))
+        with painter.while_moving():
+            views["a"].schedule_render()
+        assert not forgotten
+        views["a"].schedule_render()
+
+    painted_of(ask, 0.0)
+    assert forgotten == ["a"]

@@ -1,0 +1,160 @@
+"""Draws what moves over a kept picture of what stands still: without a graphics card a skull takes too long for each pose.
+
+The kept picture has the depth of each pixel, so that a tool behind bone stays hidden as it would be if all were drawn anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+CROSSHAIR = "vtkHandleRepresentation"
+NEAR_SHARE = 0.002  # of the farthest distance: how near to the eye a tool is still drawn
+
+
+@dataclass(frozen=True, eq=False)
+class Still:
+    """What stands still."""
+
+    stamp: tuple[Any, ...]  # of the view when it was drawn
+    colors: npt.NDArray[np.uint8]  # (height, width, 3), from the bottom up
+    depths: npt.NDArray[np.float32]  # (height, width), mm before the eye
+
+
+class MovingPicture:
+    """The picture of a 3-D view for trame-rca's scheduler (`img_cols_rows`).
+
+    Parameters
+    ----------
+    view : trame_slicer.views.ThreeDView
+    models : callable
+        Gives the model nodes that move; they are left out of the view itself, and drawn here.
+    """
+
+    def __init__(self, view: Any, models: Callable[[], Iterable[Any]]) -> None:
+        from slicer import vtkMRMLLayerDisplayableManager
+        from vtkmodules.vtkCommonCore import vtkFloatArray, vtkUnsignedCharArray
+        from vtkmodules.vtkCommonDataModel import vtkImageData
+        from vtkmodules.vtkRenderingCore import vtkRenderer, vtkRenderWindow
+
+        self._view, self._models = view, models
+        self._read_buffer, self._image = vtkMRMLLayerDisplayableManager.RenderWindowBufferToImage, vtkImageData()
+        self._depths, self._pixels = vtkFloatArray(), vtkUnsignedCharArray()
+        self._window, self._renderer = vtkRenderWindow(), vtkRenderer()
+        self._window.SetOffScreenRendering(1)
+        self._window.SetMultiSamples(0)
+        self._window.SetAlphaBitPlanes(1)
+        self._renderer.SetBackgroundAlpha(0.0)
+        self._window.AddRenderer(self._renderer)
+        self._actors: dict[str, Any] = {}
+        self._still: Still | None = None
+
+    def forget(self) -> None:
+        """Something that stands still has changed."""
+        self._still = None
+
+    @property
+    def img_cols_rows(self) -> tuple[npt.NDArray[np.uint8], int, int]:
+        """The picture (height, width, 3) from the top down, its height and its width."""
+        moving = self._place_actors()
+        if self._still is None or self._still.stamp != self._stamp(moving):
+            self._still = self._draw_still(moving)
+        picture = self._still.colors.copy()
+        if moving:
+            self._lay_over(picture, self._still)
+        return np.ascontiguousarray(picture[::-1]), picture.shape[0], picture.shape[1]
+
+    def _stamp(self, moving: bool) -> tuple[Any, ...]:
+        """Of the window's size, the camera, and everything that is drawn."""
+        size, camera = tuple(self._view.render_window().GetSize()), self._view.renderer().GetActiveCamera()
+        times = [prop.GetRedrawMTime() for prop in self._props() if prop.GetVisibility() and not prop.IsA(CROSSHAIR)]
+        return moving, size, camera.GetMTime(), len(times), max(times, default=0)
+
+    def _props(self) -> list[Any]:
+        return [prop for renderer in self._view.render_window().GetRenderers() for prop in renderer.GetViewProps()]
+
+    def _draw_still(self, moving: bool) -> Still:
+        from vtkmodules.util.numpy_support import vtk_to_numpy
+
+        window = self._view.render_window()
+        for prop in self._props():
+            if prop.IsA(CROSSHAIR):  # it follows the tip: where a tool is to be seen, that is the place
+                prop.SetVisibility(not moving)
+        window.Render()
+        self._read_buffer(window, self._image)
+        width, height, _ = self._image.GetDimensions()
+        colors = vtk_to_numpy(self._image.GetPointData().GetScalars()).reshape(height, width, -1)[..., :3].copy()
+        window.GetZbufferData(0, 0, width - 1, height - 1, self._depths)
+        depths = _before_the_eye(vtk_to_numpy(self._depths).reshape(height, width), self._view.renderer().GetActiveCamera())
+        return Still(self._stamp(moving), colors, depths)
+
+    def _place_actors(self) -> bool:
+        """Put the moving models where they are; whether any is to be seen."""
+        from vtkmodules.vtkCommonMath import vtkMatrix4x4
+
+        seen, present = False, set()
+        for node in self._models():
+            display, mesh = node.GetDisplayNode(), node.GetPolyData()
+            present.add(node.GetID())
+            actor = self._actors.get(node.GetID()) or self._new_actor(node.GetID())
+            visible = bool(mesh is not None and display.GetVisibility())
+            actor.SetVisibility(visible)
+            if not visible:
+                continue
+            seen = True
+            to_world = vtkMatrix4x4()
+            if node.GetParentTransformNode() is not None:
+                node.GetParentTransformNode().GetMatrixTransformToWorld(to_world)
+            actor.SetUserMatrix(to_world)
+            actor.GetMapper().SetInputData(mesh)
+            actor.GetProperty().SetColor(*display.GetColor())
+            actor.GetProperty().SetOpacity(display.GetOpacity())
+            actor.GetProperty().SetRepresentation(display.GetRepresentation())
+        for node_id in set(self._actors) - present:
+            self._renderer.RemoveActor(self._actors.pop(node_id))
+        return seen
+
+    def _new_actor(self, node_id: str) -> Any:
+        from vtkmodules.vtkRenderingCore import vtkActor, vtkPolyDataMapper
+
+        mapper, actor = vtkPolyDataMapper(), vtkActor()
+        mapper.ScalarVisibilityOff()
+        actor.SetMapper(mapper)
+        self._renderer.AddActor(actor)
+        self._actors[node_id] = actor
+        return actor
+
+    def _lay_over(self, picture: npt.NDArray[np.uint8], still: Still) -> None:
+        """Draw the moving models into the picture where nothing is before them."""
+        from vtkmodules.util.numpy_support import vtk_to_numpy
+
+        height, width, _ = picture.shape
+        camera = self._renderer.GetActiveCamera()
+        camera.DeepCopy(self._view.renderer().GetActiveCamera())
+        self._renderer.ResetCameraClippingRange()
+        near, far = camera.GetClippingRange()
+        camera.SetClippingRange(max(near, NEAR_SHARE * far), far)
+        self._window.SetSize(width, height)
+        self._window.Render()
+        self._window.GetRGBACharPixelData(0, 0, width - 1, height - 1, 0, self._pixels)
+        self._window.GetZbufferData(0, 0, width - 1, height - 1, self._depths)
+        pixels = vtk_to_numpy(self._pixels).reshape(height, width, 4)
+        depths = vtk_to_numpy(self._depths).reshape(height, width)
+        rows, columns = np.nonzero(pixels[..., 3])
+        before = _before_the_eye(depths[rows, columns], camera) < still.depths[rows, columns]
+        rows, columns = rows[before], columns[before]
+        share = pixels[rows, columns, 3:].astype(np.float32) / 255.0
+        mixed = share * pixels[rows, columns, :3] + (1.0 - share) * picture[rows, columns]
+        picture[rows, columns] = mixed.astype(np.uint8)
+
+
+def _before_the_eye(depths: npt.NDArray[Any], camera: Any) -> npt.NDArray[np.float32]:
+    """Depths of the buffer (0 at the near, 1 at the far plane) as distances along the view, mm; inf where nothing is drawn."""
+    near, far = camera.GetClippingRange()
+    parallel = camera.GetParallelProjection()
+    distances = near + depths * (far - near) if parallel else near * far / (far - depths * (far - near))
+    return np.where(depths < 1.0, distances, np.inf).astype(np.float32)
