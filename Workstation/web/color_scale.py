@@ -8,6 +8,8 @@ import numpy as np
 from CranioNavLib import host
 from CranioNavLib.rigid import Array
 
+from Workstation.web import words
+
 # Lightness rises evenly, blue turns to yellow: what both common kinds of red-green blindness keep.
 STOPS = np.array([[52, 92, 190], [98, 122, 176], [146, 150, 150], [200, 188, 108], [254, 232, 56]]) / 255
 NAME = "CranioNav error scale"
@@ -28,7 +30,7 @@ def gradient() -> str:
 
 def ticks(most_mm: float) -> list[str]:
     """Numbers below the scale; what lies above its end looks like its end."""
-    return ["0", f"{most_mm / 2:g}", f"≥ {most_mm:g} mm"]
+    return ["0", f"{most_mm / 2:g}", words.SCALE_END.format(most=most_mm)]
 
 
 def color_node() -> Any:

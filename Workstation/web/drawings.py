@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from CranioNavLib import scene
 
+from Workstation.web import words
+
 WIDTH, HEIGHT = 300, 76  # of the A-line's drawing
 COLUMNS = 150
 BULLS_EYE_DEG = 15.0  # at the rim
@@ -54,7 +56,9 @@ def a_line(logic: Any) -> dict[str, Any] | None:
         "bone": x(skin_s + 2e-3 * depth / speed) if found else None,
         "gate": gate,
         "accepted": accepted,
-        "text": f"bone {depth:.1f} mm deep" if found and accepted else reason_in_words(measured.reasons[-1] or "no echo"),
+        "text": words.BONE_DEPTH.format(depth=depth)
+        if found and accepted
+        else reason_in_words(measured.reasons[-1] or words.NO_ECHO),
     }
 
 
@@ -70,7 +74,7 @@ def bulls_eye(logic: Any) -> dict[str, Any] | None:
         "y": round(50 - 45 * up / length, 1),
         "aligned": bool(guide.aligned),
         "good": bool(guide.on_target and guide.aligned and (live is None or live[2].accepted[-1])),
-        "text": f"{guide.distance_mm:.0f} mm from the point, tilted by {guide.angle_deg:.0f}°",
+        "text": words.AT_POINT.format(distance=guide.distance_mm, angle=guide.angle_deg),
         "ring": round(45 * 2.0 / BULLS_EYE_DEG, 1),
     }
 

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 from trame.widgets import html
 
+from Workstation.web import words
 from Workstation.web.drawings import HEIGHT, WIDTH
 
 GOOD, WARNING, BLUE = "#2fbf8f", "#f0b429", "#6cb8f0"
 A_LINE = f"""
-<svg viewBox="0 0 {WIDTH} {HEIGHT + 14}" width="100%" role="img" aria-label="A-line">
+<svg viewBox="0 0 {WIDTH} {HEIGHT + 14}" width="100%" role="img" aria-label="{words.A_LINE}">
   <rect x="0" y="0" width="{WIDTH}" height="{HEIGHT}" fill="#10151b" rx="4"/>
   <rect v-if="live.line.gate" :x="live.line.gate[0]" y="0" :width="Math.max(0, live.line.gate[1] - live.line.gate[0])"
     height="{HEIGHT}" fill="#1f2c3a"/>
   <path :d="live.line.path" stroke="{BLUE}" stroke-width="1.4" fill="none"/>
   <g v-if="live.line.skin !== null"><line :x1="live.line.skin" :x2="live.line.skin" y1="0" y2="{HEIGHT}" stroke="#cfd8dc"
-    stroke-dasharray="3 3"/><text :x="live.line.skin + 3" y="11" fill="#cfd8dc" font-size="11">skin</text></g>
+    stroke-dasharray="3 3"/><text :x="live.line.skin + 3" y="11" fill="#cfd8dc" font-size="11">{words.SKIN}</text></g>
   <g v-if="live.line.bone !== null"><line :x1="live.line.bone" :x2="live.line.bone" y1="0" y2="{HEIGHT}"
     :stroke="live.line.accepted ? '{GOOD}' : '{WARNING}'" stroke-width="2"/>
     <text :x="live.line.bone + 3" y="{HEIGHT - 4}"
-    :fill="live.line.accepted ? '{GOOD}' : '{WARNING}'" font-size="11">bone</text></g>
-  <text x="0" y="{HEIGHT + 12}" fill="#b0bec5" font-size="11">A-line; the light band is the gate</text>
+    :fill="live.line.accepted ? '{GOOD}' : '{WARNING}'" font-size="11">{words.BONE}</text></g>
+  <text x="0" y="{HEIGHT + 12}" fill="#b0bec5" font-size="11">{words.A_LINE_HINT}</text>
 </svg>"""
 BULLS_EYE = f"""
-<svg viewBox="0 0 100 100" width="96" role="img" aria-label="Tilt of the probe">
+<svg viewBox="0 0 100 100" width="96" role="img" aria-label="{words.TILT_OF_PROBE}">
   <circle cx="50" cy="50" r="46" fill="#10151b" stroke="#546e7a"/>
   <circle cx="50" cy="50" r="23" fill="none" stroke="#37474f"/>
   <circle cx="50" cy="50" :r="live.eye.ring" fill="none" stroke="{GOOD}" stroke-width="2"/>

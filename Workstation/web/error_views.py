@@ -8,6 +8,7 @@ import numpy as np
 from CranioNavLib import host, scene, scene_data
 from CranioNavLib.rigid import Array, transform_points
 
+from Workstation.web import words
 from Workstation.web.color_scale import color_by, gradient, ticks
 
 MAP, RESIDUALS, NONE = "map", "residuals", "none"
@@ -36,11 +37,10 @@ class ErrorViews:
             self._points.GetDisplayNode().SetVisibility(has_points)
         if has_map:
             taken = self._mapped[3]
-            note = f"expected with the {taken} points taken" if taken else ""
-            return _legend("Expected error, 95 %", MAP, note)
+            return _legend(words.EXPECTED_ERROR, MAP, words.WITH_POINTS.format(count=taken) if taken else "")
         if has_points:
             rejected = scene_data.get_table("Residuals")["used"].count("no")
-            return _legend("Bone points: distance to the bone", RESIDUALS, f"crosses: {rejected} left out" if rejected else "")
+            return _legend(words.BONE_POINTS, RESIDUALS, words.LEFT_OUT.format(count=rejected) if rejected else "")
         return None
 
     def _map(self, bone: Any) -> bool:

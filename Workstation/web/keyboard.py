@@ -6,11 +6,13 @@ from CranioNavLib.panel import Action
 from trame.widgets import client, html
 from trame.widgets import vuetify3 as v3
 
+from Workstation.web import words
 from Workstation.web.panel_view import PanelView
 from Workstation.web.procedure import HAND, ProcedureStep
 from Workstation.web.toolbar import KEYS
 from Workstation.web.view_controls import STEPS_MM
 
+# Another step is seen from its beginning.
 # Text fields keep their keys; a button or slider reached by Tab keeps those that work it, one that was clicked does not.
 # Once: another layout draws the page anew, and with it this script.
 LISTEN = """
@@ -19,6 +21,9 @@ window.cranionavKeys = true;
 window.addEventListener('click', (event) => {
   const button = event.detail && event.target.closest && event.target.closest('button, a');
   if (button) button.blur();
+  if (event.target.closest && event.target.closest('[data-step], [data-go], [data-key=N], [data-key=B]')) {
+    setTimeout(() => document.querySelectorAll('.v-navigation-drawer__content').forEach((one) => { one.scrollTop = 0; }), 50);
+  }
 }, true);
 window.addEventListener('keydown', (event) => {
   const at = event.target;
@@ -63,9 +68,9 @@ def draw_help(procedure: tuple[ProcedureStep, ...], panels: dict[str, PanelView]
     """The button "?" of the title bar with its list, and the listener of the keys."""
     client.Script(LISTEN)
     _draw_hidden(procedure)
-    v3.VBtn("?", icon=True, size="small", click="keys = !keys", title="Keys (?)", raw_attrs=["data-keys"])
-    everywhere = [(key, what, "every step") for key, what in (*KEYS, ("?", "Show or hide this list"))]
-    with v3.VDialog(v_model=("keys", False), max_width=760, scrollable=True), v3.VCard(title="Keys"), v3.VCardText():
+    v3.VBtn("?", icon=True, size="small", click="keys = !keys", title=words.KEYS_HINT, raw_attrs=["data-keys"])
+    everywhere = [(key, what, words.EVERY_STEP) for key, what in KEYS]
+    with v3.VDialog(v_model=("keys", False), max_width=760, scrollable=True), v3.VCard(title=words.KEYS), v3.VCardText():
         for key, what, step in (*shortcuts(procedure, panels), *everywhere):
             with html.Div(classes="d-flex py-1", style="gap: 16px"):
                 html.Div(key, style="width: 130px; flex: none", classes="font-weight-bold")

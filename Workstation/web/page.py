@@ -8,6 +8,7 @@ from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import client, html
 from trame.widgets import vuetify3 as v3
 
+from Workstation.web import words
 from Workstation.web.drawings_view import STYLE as DRAWINGS_STYLE
 from Workstation.web.drawings_view import draw_live
 from Workstation.web.keyboard import draw_help
@@ -46,7 +47,7 @@ class Page:
     def __init__(self, server: Any, panels: dict[str, PanelView], layouts: Any, procedure: tuple[ProcedureStep, ...]) -> None:
         self.server, self.panels = server, panels
         server.state.step = procedure[0].name
-        server.state.trame__title = "CranioNav"
+        server.state.trame__title = words.TITLE
         with VAppLayout(server) as self.layout:
             self.layout.root.theme = "dark"
             client.Style(STYLE + DRAWINGS_STYLE + FRAME_STYLE)
@@ -58,9 +59,9 @@ class Page:
 
     def _draw_title(self, procedure: tuple[ProcedureStep, ...]) -> None:
         with v3.VAppBar(density="compact", flat=True, border=True):
-            v3.VAppBarTitle("CranioNav")
+            v3.VAppBarTitle(words.TITLE)
             draw_link()
-            html.Div("Research software, not a medical device", classes="text-body-2 text-medium-emphasis mr-4")
+            html.Div(words.DISCLAIMER, classes="text-body-2 text-medium-emphasis mr-4")
             draw_toolbar()
             draw_sounds()
             draw_help(procedure, self.panels)
@@ -113,10 +114,11 @@ class Page:
             color=(f"{done} ? 'success' : 'info'",),
             raw_attrs=[f'data-next="{step.name}"'],
         ):
-            html.Div(f"{{{{ {done} ? 'Done.' : 'Now: ' + ({waiting} || 'see below') }}}}", classes="text-body-1")
+            now = f"'{words.NOW}' + ({waiting} || '{words.SEE_BELOW}')"
+            html.Div(f"{{{{ {done} ? '{words.DONE}' : {now} }}}}", classes="text-body-1")
             if after is not None:
                 v3.VBtn(
-                    f"Next: {after.title}",
+                    words.NEXT_STEP.format(title=after.title),
                     classes="mt-2",
                     size="small",
                     variant=(f"{done} ? 'flat' : 'outlined'",),
@@ -126,7 +128,7 @@ class Page:
 
     def _draw_files(self) -> None:
         v3.VBtn(
-            "Open {{ one }}",
+            f"{words.OPEN_FILE} {{{{ one }}}}",
             v_for="one in files",
             key="one",
             block=True,

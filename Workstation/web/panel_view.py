@@ -23,6 +23,7 @@ from CranioNavLib.panel_model import PanelModel
 from trame.widgets import html
 from trame.widgets import vuetify3 as v3
 
+from Workstation.web import words
 from Workstation.web.panel_state import choices_of, panel_state, parse, translated
 
 Translation = Callable[[str], str]
@@ -78,7 +79,7 @@ class PanelView:
         if settings:
             with (
                 v3.VExpansionPanels(variant="accordion", classes="my-2"),
-                v3.VExpansionPanel(title="Details", raw_attrs=[f'data-details="{step.name}"']),
+                v3.VExpansionPanel(title=words.DETAILS, raw_attrs=[f'data-details="{step.name}"']),
                 v3.VExpansionPanelText(),
             ):
                 for item in settings:
@@ -198,7 +199,7 @@ class PanelView:
         entered = f"trigger('{self.key}_setting', ['{item.name}', one.name, $event.target.value])"
         with (
             v3.VExpansionPanels(v_if=f"{self.key}.settings['{item.name}'].length", variant="accordion", classes="my-2"),
-            v3.VExpansionPanel(title="Settings"),
+            v3.VExpansionPanel(title=words.SETTINGS),
             v3.VExpansionPanelText(),
             html.Div(v_for=f"one in {self.key}.settings['{item.name}']", key="one.key", classes="my-2"),
         ):
@@ -224,7 +225,7 @@ class PanelView:
             v3.VProgressLinear(
                 model_value=(f"100 * {self.key}.busy.share",), indeterminate=(f"!{self.key}.busy.share",), height=6
             )
-            v3.VBtn("Cancel", size="small", variant="text", click=f"trigger('{self.key}_cancel')")
+            v3.VBtn(words.CANCEL, size="small", variant="text", click=f"trigger('{self.key}_cancel')")
         html.Div(
             f"{{{{ {SIGNS}[{self.key}.message.level] + {self.key}.message.text }}}}",
             v_if=f"{self.key}.message.text && {mine}",

@@ -5,20 +5,22 @@ from __future__ import annotations
 from trame.widgets import html
 from trame.widgets import vuetify3 as v3
 
+from Workstation.web import words
 from Workstation.web.error_views import MAP, NONE, RESIDUALS
 from Workstation.web.view_controls import LAYOUTS, WINDOWS
 
 # (key, what it does) of what the keys of the page do in every step
 KEYS = (
-    *((choice.key, choice.title) for choice in LAYOUTS.values()),
-    ("W", "Next grey window: " + ", ".join(window.title.lower() for window in WINDOWS.values())),
-    ("D", "Dragging in a slice sets the grey window, or no longer"),
-    ("R", "Reset all views"),
-    ("E", "In colours: expected error on the skull, distance of the bone points, or nothing"),
-    ("M", "Sounds on or off"),
-    ("N", "Next step"),
-    ("B", "Step before"),
-    ("Arrows, Page up/down", "Move the slices by 1 mm (Shift: 10 mm), where the step itself has no use for the key"),
+    *((choice.key, words.LAYOUTS[name]) for name, choice in LAYOUTS.items()),
+    ("W", words.NEXT_WINDOW.format(titles=", ".join(words.WINDOWS.values()).lower())),
+    ("D", words.DRAG_WINDOW),
+    ("R", words.RESET),
+    ("E", words.ERROR_COLORS),
+    ("M", words.SOUNDS),
+    ("N", words.STEP_ON),
+    ("B", words.STEP_BACK),
+    (words.MOVE_KEYS, words.MOVE),
+    ("?", words.SHOW_KEYS),
 )
 
 
@@ -36,7 +38,7 @@ def draw_toolbar() -> None:
             v3.VBtn(
                 icon=choice.icon,
                 value=name,
-                title=f"{choice.title} ({choice.key})",
+                title=f"{words.LAYOUTS[name]} ({choice.key})",
                 width=34,
                 raw_attrs=[f'data-key="{choice.key}"'],
             )
@@ -48,21 +50,22 @@ def draw_toolbar() -> None:
         classes="mr-1",
         raw_attrs=["data-windows"],
     ):
-        for name, window in WINDOWS.items():
-            v3.VBtn(window.title, value=name, title=f"Grey window for {window.title.lower()} (W: the next)", size="small")
+        for name in WINDOWS:
+            title = words.WINDOWS[name]
+            v3.VBtn(title, value=name, title=words.WINDOW_HINT.format(title=title.lower()), size="small")
     html.Button(style="display: none", click="trigger('view_window', [''])", raw_attrs=['data-key="W"'])
-    _switch("drag_window", "mdi-contrast-circle", "Dragging in a slice sets the grey window (D)", "D", "view_drag")
+    _switch("drag_window", "mdi-contrast-circle", f"{words.DRAG_WINDOW} (D)", "D", "view_drag")
     v3.VBtn(
         icon="mdi-fit-to-screen-outline",
         size="small",
-        title="Reset all views (R)",
+        title=f"{words.RESET} (R)",
         click="trigger('view_reset')",
         raw_attrs=['data-key="R"'],
     )
     v3.VBtn(
         icon=(f"({{ {MAP}: 'mdi-gradient-horizontal', {RESIDUALS}: 'mdi-dots-hexagon', {NONE}: 'mdi-palette' }})[error_shown]",),
         size="small",
-        title="In colours: expected error on the skull, distance of the bone points, or nothing (E)",
+        title=f"{words.ERROR_COLORS} (E)",
         color=(f"error_shown === '{NONE}' ? undefined : 'primary'",),
         click=f"error_shown = {{ {MAP}: '{RESIDUALS}', {RESIDUALS}: '{NONE}', {NONE}: '{MAP}' }}[error_shown]",
         raw_attrs=['data-key="E"', ':data-error="error_shown"'],
@@ -70,7 +73,7 @@ def draw_toolbar() -> None:
     v3.VBtn(
         icon=("muted ? 'mdi-volume-off' : 'mdi-volume-high'",),
         size="small",
-        title="Sounds on or off (M)",
+        title=f"{words.SOUNDS} (M)",
         click="muted = !muted",
         color=("muted ? 'warning' : undefined",),
         raw_attrs=['data-key="M"', "data-mute"],

@@ -16,7 +16,6 @@ from Workstation.web.error_views import MAP
 class LayoutChoice:
     """One arrangement of the views."""
 
-    title: str
     icon: str
     key: str
 
@@ -25,25 +24,24 @@ class LayoutChoice:
 class GreyWindow:
     """Which part of the CT's scale becomes grey, HU."""
 
-    title: str
     width_hu: float
     level_hu: float
 
 
 # Names as in Slicer's own layouts; trame-slicer knows the views by these tags.
 LAYOUTS = {
-    "four": LayoutChoice("Four views", "mdi-view-grid-outline", "1"),
-    "wide": LayoutChoice("Large 3-D, slices beside it", "mdi-view-split-vertical", "2"),
-    "3d": LayoutChoice("3-D only", "mdi-cube-outline", "3"),
-    "axial": LayoutChoice("Large axial slice", "mdi-alpha-a-box-outline", "4"),
-    "sagittal": LayoutChoice("Large sagittal slice", "mdi-alpha-s-box-outline", "5"),
-    "coronal": LayoutChoice("Large coronal slice", "mdi-alpha-c-box-outline", "6"),
+    "four": LayoutChoice("mdi-view-grid-outline", "1"),
+    "wide": LayoutChoice("mdi-view-split-vertical", "2"),
+    "3d": LayoutChoice("mdi-cube-outline", "3"),
+    "axial": LayoutChoice("mdi-alpha-a-box-outline", "4"),
+    "sagittal": LayoutChoice("mdi-alpha-s-box-outline", "5"),
+    "coronal": LayoutChoice("mdi-alpha-c-box-outline", "6"),
 }
 # The usual windows of radiology for a head CT; "skin" shows where the air ends.
 WINDOWS = {
-    "bone": GreyWindow("Bone", 2000, 400),
-    "brain": GreyWindow("Brain", 80, 40),
-    "skin": GreyWindow("Skin", 900, -150),
+    "bone": GreyWindow(2000, 400),
+    "brain": GreyWindow(80, 40),
+    "skin": GreyWindow(900, -150),
 }
 STEPS_MM = {
     "ArrowLeft": (1, 0, 0),

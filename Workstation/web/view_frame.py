@@ -8,11 +8,8 @@ from trame.widgets import html
 from trame_slicer.app.logic.slice_view_logic import connect_slice_view_slider_to_state
 from trame_slicer.app.ui.slider import Slider
 
-SIDES = {  # left, right, top and bottom of a slice as radiology shows it
-    "Axial": ("R", "L", "A", "P"),
-    "Coronal": ("R", "L", "S", "I"),
-    "Sagittal": ("A", "P", "S", "I"),
-}
+from Workstation.web import words
+
 PLACES = (
     "left: 8px; top: 50%; transform: translateY(-50%)",
     "right: 8px; top: 50%; transform: translateY(-50%)",
@@ -36,7 +33,7 @@ def slice_frame(server: Any, view_id: str, view: Any) -> None:
     """Over a slice view."""
     name = view.get_orientation()
     html.Div(name, classes="over over-name")
-    for side, place in zip(SIDES.get(name, ()), PLACES, strict=False):
+    for side, place in zip(words.SIDES.get(name, ()), PLACES, strict=False):
         html.Div(side, classes="over", style=place)
     with html.Div(classes="slice-slider-gutter", style="position: absolute; bottom: 0; left: 0; width: 100%;"):
         Slider(classes="slice-slider", typed_state=connect_slice_view_slider_to_state(server, view), theme="dark", dense=True)
@@ -44,5 +41,5 @@ def slice_frame(server: Any, view_id: str, view: Any) -> None:
 
 def threed_frame(server: Any, view_id: str, view: Any) -> None:
     """Over a 3-D view."""
-    html.Div("3-D", classes="over over-name")
+    html.Div(words.SOLID, classes="over over-name")
     html.Div(LEGEND, v_if="legend", classes="over legend", raw_attrs=["data-legend"])
