@@ -41,7 +41,7 @@ def probe(
     name: Name,
     set_: Set = None,
     seconds: Annotated[float, typer.Option(min=0.2, help="how long to listen")] = 3.0,
-    timeout: Annotated[float, typer.Option(min=0.5, help="longest wait for the connection, in s")] = 15.0,
+    timeout: Annotated[float, typer.Option(min=0.5, help="longest wait for the connection, in s")] = 30.0,
     json: Json = False,
 ) -> None:
     """Connect to a tracker, listen, and tell what it sees."""
@@ -87,7 +87,7 @@ def record(
     amode_set: Annotated[
         Optional[list[str]], typer.Option("--amode-set", metavar="PARAMETER=VALUE", help="a parameter of that device")
     ] = None,
-    timeout: Annotated[float, typer.Option(min=0.5, help="longest wait for the connection, in s")] = 15.0,
+    timeout: Annotated[float, typer.Option(min=0.5, help="longest wait for the connection, in s")] = 30.0,
     json: Json = False,
 ) -> None:
     """Record all tools, and A-lines where a device is named, frame by frame; Ctrl-C ends it."""

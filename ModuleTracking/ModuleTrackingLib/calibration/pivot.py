@@ -15,11 +15,11 @@ from scipy.special import gammainc
 
 FEWEST_POSES = 20
 SAMPLE = 8  # poses of one random trial: enough tilt among them, and free of slips in 43 % of trials at 10 % slips
-CHI3_MEDIAN = 1.5382  # median length of a 3-vector of unit normal numbers
+CHI1_MEDIAN, CHI2_MEDIAN, CHI3_MEDIAN = 0.6745, 1.1774, 1.5382  # median length of a vector of 1, 2, 3 unit normal numbers
 SLIP_SDS = 4.0  # a miss beyond so many per-axis SDs is a slip...
 CERTAIN_SDS = 5.0  # ...unless misses beyond 4 SDs are as few as chance gives, and none is beyond 5
 MIN_SINGULAR_RATIO = 0.04  # simulated: poses spread over a cone of about 10 deg half-angle
-UNEQUAL_VARIANCES = 1.5  # across against along the tool; below, equal weights lose less than 2 % and risk nothing
+WORTH_WEIGHTING = 0.75  # predicted SD of the tip, weighted against equal weights: less is gained than chance may cost
 MOST_SLIPS = 0.45
 
 
@@ -75,8 +75,8 @@ def calibrate_pivot(
 ) -> PivotCalibration:
     """Tip of a tool that was pivoted about a fixed point.
 
-    Poses whose tip left the point (slips) are found by random trials and left out. If the misses across the tool are
-    larger than along it, which an error of the tracked rotation makes them, they are weighted by their own variances.
+    Poses whose tip left the point (slips) are found by random trials and left out. Where the misses across the tool are
+    much larger than along it, which an error of the tracked rotation makes them, they are weighted by their own variances.
 
     Parameters
     ----------
@@ -182,15 +182,20 @@ def _algebraic(poses: Array, weights: Array) -> tuple[Array, Array, Array]:
     """
     turn, origin = poses[:, :3, :3], poses[:, :3, 3]
     information = np.broadcast_to(np.diag(weights), turn.shape) if weights.ndim == 1 else weights
-    turned = np.swapaxes(turn, 1, 2) @ information
-    normal = np.block(
-        [[(turned @ turn).sum(axis=0), -turned.sum(axis=0)], [-np.swapaxes(turned, 1, 2).sum(axis=0), information.sum(axis=0)]]
-    )
     pushed = np.einsum("nij,nj->ni", information, origin)
     right = np.concatenate([-np.einsum("nji,nj->i", turn, pushed), pushed.sum(axis=0)])
-    inverse = np.linalg.pinv(normal, hermitian=True)
-    solution = inverse @ right
+    inverse = np.asarray(np.linalg.pinv(_normal(turn, information), hermitian=True), dtype=float)
+    solution: Array = inverse @ right
     return solution[:3], solution[3:], inverse
+
+
+def _normal(turn: Array, weights: Array) -> Array:
+    """(6, 6): the sum over the poses of [R, -1]' W [R, -1]."""
+    turned = np.swapaxes(turn, 1, 2) @ weights
+    normal: Array = np.block(
+        [[(turned @ turn).sum(axis=0), -turned.sum(axis=0)], [-np.swapaxes(turned, 1, 2).sum(axis=0), weights.sum(axis=0)]]
+    )
+    return normal
 
 
 def _misses(poses: Array, tip: Array, pivot: Array) -> Array:
@@ -208,21 +213,29 @@ def _without_slips(poses: Array, rng: np.random.Generator, trials: int) -> npt.N
         medians[chosen] = np.median(np.sum(ends**2, axis=2), axis=1)
     best = int(np.argmin(medians))
     misses = np.linalg.norm(_misses(poses, tips[best], pivots[best]), axis=1)
-    scale = float(np.sqrt(medians[best])) / CHI3_MEDIAN
-    used: npt.NDArray[np.bool_] = misses <= SLIP_SDS * scale
+    used: npt.NDArray[np.bool_] = misses <= SLIP_SDS * float(np.sqrt(medians[best])) / CHI3_MEDIAN
     for _ in range(50):
         tip, pivot, _ = _algebraic(poses[used], np.ones(3))
-        misses = np.linalg.norm(_misses(poses, tip, pivot), axis=1)
-        scale = float(np.median(misses[used])) / CHI3_MEDIAN
-        again = misses <= SLIP_SDS * max(scale, 1e-9)
+        misses = _in_sds(poses, tip, pivot, used)
+        again = misses <= SLIP_SDS
         if np.array_equal(again, used):
             break
         used = again
     beyond = 1 - gammainc(1.5, SLIP_SDS**2 / 2)  # of normal misses
     by_chance = gammainc(float((~used).sum()), len(poses) * beyond)  # Poisson's P(that many or more)
-    if by_chance > 1e-3 and misses.max() <= CERTAIN_SDS * max(scale, 1e-9):
+    if by_chance > 1e-3 and misses.max() <= CERTAIN_SDS:
         used = np.ones(len(poses), dtype=bool)
     return used
+
+
+def _in_sds(poses: Array, tip: Array, pivot: Array, used: npt.NDArray[np.bool_]) -> Array:
+    """(N,) length of each miss in SDs of those used; along the tool and across it have SDs of their own."""
+    misses, lever = _misses(poses, tip, pivot), _lever_directions(poses, tip)
+    along = np.sum(misses * lever, axis=1)
+    across = np.linalg.norm(misses - along[:, None] * lever, axis=1)
+    sd_along = max(float(np.median(np.abs(along[used]))) / CHI1_MEDIAN, 1e-9)
+    sd_across = max(float(np.median(across[used])) / CHI2_MEDIAN, 1e-9)
+    return np.asarray(np.hypot(along / sd_along, across / sd_across))
 
 
 def _trial_solutions(poses: Array, rng: np.random.Generator, trials: int) -> tuple[Array, Array]:
@@ -241,14 +254,16 @@ def _fit(poses: Array, method: PivotMethod) -> tuple[Array, Array, Array, Array]
     tip, pivot, inverse = _algebraic(poses, np.ones(3))
     misses = _misses(poses, tip, pivot)
     along, across = _variances(poses, tip, misses)
-    if across > UNEQUAL_VARIANCES * along:
-        for _ in range(5):
-            tip, pivot, inverse = _algebraic(poses, _information(poses, tip, along, across))
-            misses = _misses(poses, tip, pivot)
-            along, across = _variances(poses, tip, misses)
-        return tip, pivot, inverse[:3, :3], misses
-    variance = float(np.sum(misses**2)) / (3 * len(poses) - 6)
-    return tip, pivot, inverse[:3, :3] * variance, misses
+    lever = _lever_directions(poses, tip)
+    covariance = inverse @ _normal(poses[:, :3, :3], _spread_out(lever, along, across)) @ inverse
+    best = np.linalg.pinv(_normal(poses[:, :3, :3], _spread_out(lever, 1 / along, 1 / across)), hermitian=True)
+    if np.trace(best[:3, :3]) > WORTH_WEIGHTING**2 * np.trace(covariance[:3, :3]):
+        return tip, pivot, covariance[:3, :3], misses
+    for _ in range(5):
+        tip, pivot, inverse = _algebraic(poses, _spread_out(_lever_directions(poses, tip), 1 / along, 1 / across))
+        misses = _misses(poses, tip, pivot)
+        along, across = _variances(poses, tip, misses)
+    return tip, pivot, inverse[:3, :3], misses
 
 
 def _lever_directions(poses: Array, tip: Array) -> Array:
@@ -269,11 +284,11 @@ def _variances(poses: Array, tip: Array, misses: Array) -> tuple[float, float]:
     return max(float(np.sum(along**2)) / free, 1e-12), max(float(np.sum(across)) / (2 * free), 1e-12)
 
 
-def _information(poses: Array, tip: Array, along: float, across: float) -> Array:
-    lever = _lever_directions(poses, tip)
+def _spread_out(lever: Array, along: float, across: float) -> Array:
+    """(N, 3, 3) matrices with one eigenvalue along the lever (N, 3) and another across it."""
     outer = lever[:, :, None] * lever[:, None, :]
-    information: Array = outer / along + (np.eye(3) - outer) / across
-    return information
+    matrices: Array = along * outer + across * (np.eye(3) - outer)
+    return matrices
 
 
 def _sphere(poses: Array) -> tuple[Array, Array, Array, Array]:
