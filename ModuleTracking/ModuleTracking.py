@@ -116,8 +116,7 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
             raise
         for frame in frames:
             self._writeFrame(frame)
-        if not frames:
-            self._writeStale()
+        self._writeStale()
         if self._recorder is not None:
             self._recorder.add_frames(frames)
         self._finishCalibration()
@@ -142,12 +141,14 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
                 self._calibrator.add(pose.tool, matrix)
 
     def _writeStale(self):
-        """Tools without news lose their pose in the scene, too."""
-        for tool in Tool:
-            if tool.value in self.stream.tool_names:
-                current = self.stream.current_in_reference(tool.value)
-                if not current.usable:
-                    scene_data.set_pose(f"{tool.value}ToReference", None, current.status.value, current.host_time_s)
+        """Tools without news lose their pose in the scene, too, even if others or old frames go on coming."""
+        base = self.stream.is_live("Reference")
+        for tool in (tool.value for tool in Tool):
+            if (base and self.stream.is_live(tool)) or tool not in self.stream.tool_names:
+                continue
+            current = self.stream.current_in_reference(tool)
+            if not current.usable and scene_data.get_pose(f"{tool}ToReference").status != current.status.value:
+                scene_data.set_pose(f"{tool}ToReference", None, current.status.value, current.host_time_s)
 
     # Calibration
 

@@ -133,6 +133,12 @@ class PoseStream(DeviceStream):
             return replace(latest, tool_to_tracker=None, status=PoseStatus.STALE, flags=(f"no news for {age:.1f} s",))
         return latest
 
+    def is_live(self, tool: str) -> bool:
+        """Whether the tool's latest news is a pose, and young enough to be shown."""
+        history = self._histories.get(tool)
+        latest = history.latest if history is not None else None
+        return latest is not None and latest.usable and self._clock() - latest.host_time_s <= self.staleness_s
+
     def current_in_reference(self, tool: str) -> RelativePose:
         """The tool now, in the reference base's frame; without a pose when tool or base is lost or stale."""
         latest = self.current(tool)

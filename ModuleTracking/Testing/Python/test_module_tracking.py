@@ -29,6 +29,7 @@ class Script:
 
     refuse = ""
     broken = False
+    silent: tuple = ()  # tools that the tracker says nothing of, not even that they are missing
     tools: dict = {}  # tool -> ToolToReference, or a function of the frame's number  # noqa: RUF012
 
 
@@ -66,7 +67,9 @@ class ScriptedTracker(Tracker):
         self.frame += 1
         now = time.monotonic()
         poses = [ToolPose("Reference", BASE, PoseStatus.OK, now, frame_number=self.frame)]
-        for name in ("Stylus", "Probe"):
+        if "Reference" in Script.silent:
+            return []
+        for name in {"Stylus", "Probe"}.difference(Script.silent):
             pose = Script.tools.get(name)
             pose = pose(self.frame) if callable(pose) else pose
             status = PoseStatus.OK if pose is not None else PoseStatus.MISSING
@@ -83,6 +86,7 @@ def pivoting(frame):
 @pytest.fixture
 def a_logic():
     host.scene().Clear(False)
+    Script.silent = ()
     Script.refuse, Script.broken, Script.tools = "", False, {"Stylus": rigid(np.eye(3), DIVOT)}
     logic = module.ModuleTrackingLogic()
     logic.parameters().change(tracker="scripted", rest_s=0.1)
@@ -140,6 +144,24 @@ def test_a_lost_tool_has_no_pose_in_the_scene(a_logic):
     run_until(a_logic, lambda: scene_data.get_pose("StylusToReference").status == "MISSING")
     assert scene_data.get_pose("StylusToReference").matrix is None
     assert a_logic.stylusTool().level is Level.BAD
+
+
+@pytest.mark.parametrize("silent", [("Reference", "Stylus", "Probe"), ("Stylus",)], ids=["nothing comes", "others go on"])
+def test_a_tool_without_news_for_200_ms_is_lost_at_the_next_poll(a_logic, silent):
+    a_logic.connect()
+    run_until(a_logic, seen())
+    Script.silent = silent
+    end = time.monotonic() + 0.05
+    run_until(a_logic, lambda: time.monotonic() > end)  # what was on its way has come
+    latest = scene_data.get_pose("StylusToReference")
+    assert latest.matrix is not None
+    a_logic.stream._clock = lambda: latest.host_time_s + 0.199
+    a_logic.poll()
+    assert scene_data.get_pose("StylusToReference").matrix is not None
+    a_logic.stream._clock = lambda: latest.host_time_s + 0.201
+    a_logic.poll()
+    assert (scene_data.get_pose("StylusToReference").matrix, scene_data.get_pose("StylusToReference").status) == (None, "STALE")
+    assert "no news" in a_logic.stylusTool().text
 
 
 def test_a_tracker_that_fails_loses_all_tools_and_comes_back_by_itself(a_logic):
