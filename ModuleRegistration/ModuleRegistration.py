@@ -30,7 +30,7 @@ from ModuleRegistrationLib.panel_description import PANEL, RegistrationParameter
 
 LEVELS = {"accepted": Level.GOOD, "warning": Level.WARNING, "refused": Level.BAD, "landmarks": Level.WARNING}
 LEAST_LANDMARKS = 3
-FAR_FROM_HEAD_MM = 30.0  # landmarks of the skin, the tip of the nose or the tragus, lie nearer than this to the skull's box
+FAR_FROM_TISSUE_MM, AIR_HU = 5.0, -400.0  # a landmark lies on the head, or in a cavity of it that is no wider than twice this
 # on OuterTable: what its segmentation promises
 POSITION_SD, OFFSET_SD, THRESHOLD = "CranioNav.PositionSdMm", "CranioNav.OffsetSdMm", "CranioNav.ThresholdHu"
 
@@ -329,11 +329,16 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
     def _offTheHead(self, position):
         """Why a place (3,) in RAS is no place for a landmark; "" if it is one."""
-        node = scene.find("Bone") or scene.find("CT")
-        bounds = [0.0] * 6
-        node.GetRASBounds(bounds)
-        inside = all(bounds[2 * k] - FAR_FROM_HEAD_MM <= position[k] <= bounds[2 * k + 1] + FAR_FROM_HEAD_MM for k in range(3))
-        return "" if inside else "the click missed the head; click on the head or on a slice through it"
+        import numpy as np
+        from CranioNavLib.rigid import transform_points
+
+        volume = scene_data.get_volume("CT")
+        middle = transform_points(np.linalg.inv(volume.ijk_to_ras), np.asarray(position, dtype=float)[None])[0]
+        reach = FAR_FROM_TISSUE_MM / np.linalg.norm(volume.ijk_to_ras[:3, :3], axis=0)  # voxels
+        low, high = (np.maximum(edge, 0).astype(int) for edge in (np.ceil(middle - reach), np.floor(middle + reach) + 1))
+        near = volume.hu[low[2] : high[2], low[1] : high[1], low[0] : high[0]]
+        on_head = near.size > 0 and near.max() > AIR_HU
+        return "" if on_head else "the click missed the head; click on the head or on a slice through it"
 
     # Registration
 
