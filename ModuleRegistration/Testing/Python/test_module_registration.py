@@ -148,6 +148,58 @@ def test_a_new_ct_forgets_what_was_found_in_the_old_one(a_patient):
     assert a_patient.landmarkStatus().state is StepState.TODO
 
 
+@pytest.fixture
+def a_ball_in_air(a_logic):
+    """A CT of a ball of tissue, 60 mm in radius about (5, -10, 20), in a rotated grid of uneven voxels."""
+    ijk_to_ras = rigid_from_vector([0.2, 0.1, -0.3], [0, 0, 0]) @ np.diag([1.0, 1.5, 2.0, 1.0])
+    ijk_to_ras[:3, 3] = (5, -10, 20) - ijk_to_ras[:3, :3] @ (80, 50, 40)
+    k, j, i = np.mgrid[:80, :100, :160]
+    places = transform_points(ijk_to_ras, np.stack([i, j, k], axis=-1).reshape(-1, 3)).reshape(*i.shape, 3)
+    inside = np.linalg.norm(places - (5, -10, 20), axis=-1) < 60
+    a_logic.takeCt(Volume(np.where(inside, 40, -1000).astype(np.int16), ijk_to_ras, "ball"))
+    return a_logic
+
+
+@pytest.mark.parametrize(
+    ("place", "refused"),
+    [((5, -10, 20), False), ((5, 49, 20), False), ((5, 53, 20), False), ((5, 60, 20), True), ((5, 500, 20), True)],
+)
+def test_a_landmark_lies_on_the_head_or_in_it(a_ball_in_air, place, refused):
+    assert ("missed the head" in a_ball_in_air._offTheHead(place)) == refused
+
+
+def test_landmarks_are_planned_without_a_mouse_and_each_step_is_taken_back(a_ball_in_air, monkeypatch):
+    from CranioNavLib import slice_views
+
+    logic = a_ball_in_air
+    assert logic.planStatus().state is StepState.TODO
+    for number in range(3):
+        monkeypatch.setattr(slice_views, "crossing", lambda number=number: np.array([5.0, 10 * number, 20]))
+        logic.placeHere()
+    planned = scene_data.get_points("LandmarksCT")
+    assert planned.labels == tuple(one.name for one in logic.landmarks())[:3]
+    np.testing.assert_allclose(planned.positions_mm[:, 1], [0, 10, 20])
+    assert logic.planStatus().state is StepState.DONE
+    logic.undoLandmark()
+    assert len(scene_data.get_points("LandmarksCT")) == 2
+    assert "place 1 more" in logic.planStatus().text
+    logic.parameters().change(landmark=planned.labels[0])
+    logic.removeLandmark()
+    assert scene_data.get_points("LandmarksCT").labels == planned.labels[1:2]
+    monkeypatch.setattr(slice_views, "crossing", lambda: np.array([5.0, 300, 20]))
+    with pytest.raises(InputError, match="missed the head"):
+        logic.placeHere()
+
+
+def test_a_further_landmark_waits_for_its_click_until_told_otherwise(a_ball_in_air):
+    logic = a_ball_in_air
+    assert "Landmark 5" in logic.addLandmark()
+    assert "Landmark 5" in logic.placing().text
+    logic.stopPlacing()
+    assert logic.placing() is None
+    assert logic.stopPlacingBlocked()
+
+
 def test_unpaired_landmarks_are_refused_and_nothing_is_written(a_patient):
     points = scene_data.get_points("LandmarksPatient")
     scene_data.set_points("LandmarksPatient", LabelledPoints(points.labels[:3], points.positions_mm[:3]))
