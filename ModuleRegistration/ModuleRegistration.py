@@ -149,7 +149,9 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
         def segment(progress: Progress):
             progress("finding bone", 0.1)
-            return segment_bone(volume, method=name, **values)
+            found = segment_bone(volume, method=name, **values)
+            progress("preparing its surface for what comes", 0.8)
+            return prepared(found)
 
         return Task("Find bone", segment, self._takeBone)
 
@@ -601,6 +603,13 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 def _inTenths(value):
     """Tenths of a millimetre are what a reader can use; the table and the files keep all digits."""
     return f"{float(value):.1f}" if "." in value else value
+
+
+def prepared(bone):
+    """The surfaces of a bone with normals and index made, so that the thread of the scene need not make them."""
+    for surface in (bone.closed, bone.outer_table):
+        surface.prepare()
+    return bone
 
 
 def _hasContent(node):

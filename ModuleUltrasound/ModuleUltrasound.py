@@ -274,17 +274,19 @@ class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
     def startRecording(self):
         """Record every line with its pose into `recording_path`; points of the protocol are taken by resting on them."""
+        from CranioNavLib.files import set_aside
         from CranioNavLib.sequence_metafile import RecordingWriter
         from ModuleUltrasoundLib.palpation import Palpation
 
         path = self.parameters().read().recording_path
+        earlier = set_aside(path)
         first = self._latest[-1].line
         self._recordingStart, self._recordedPoints = first.host_time_s, set()
         self._writer = RecordingWriter(path, len(first.samples), self.stream.acquisition)
         if self._count("ProtocolPoints"):
             self._palpation, self._fedTime = Palpation(scene_data.get_points("ProtocolPoints").labels), first.host_time_s
             self._goTo(self.currentIndex())
-        return f"recording into {path}"
+        return f"recording into {path}" + (f"; the one before is kept as {earlier.name}" if earlier is not None else "")
 
     def startRecordingBlocked(self):
         """Why nothing can be recorded now."""

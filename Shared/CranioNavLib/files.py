@@ -63,3 +63,16 @@ def output_folder(path: str | Path) -> Path:
     except OSError as error:
         raise InputError(f"cannot write into {folder}: {error.strerror}; choose another output folder") from None
     return folder
+
+
+def set_aside(path: str | Path) -> Path | None:
+    """Rename an existing file to the next free number ("a.igs.mha" -> "a-1.igs.mha"); its new path, None if there is no file."""
+    path = Path(path)
+    if not path.exists():
+        return None
+    stem, dot, suffix = path.name.partition(".")
+    number = 1
+    while (aside := path.with_name(f"{stem}-{number}{dot}{suffix}")).exists():
+        number += 1
+    path.rename(aside)
+    return aside

@@ -28,6 +28,7 @@ SPEED, SPEED_SD = "CranioNav.SpeedOfSoundMps", "CranioNav.SpeedOfSoundSdMps"
 POSE_STATUS, POSE_TIME = "CranioNav.PoseStatus", "CranioNav.PoseTimeS"  # on the transforms of tracked tools
 MOTION_ERROR = "CranioNav.MotionError"  # on ReferenceToRas: JSON of its covariance, pivot and degrees of freedom
 AXES = "xyz"
+_surfaces: dict[str, tuple[Any, int, Surface]] = {}  # role: (its mesh, when that was changed last, the same with its index)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +133,9 @@ def set_surface(role: str, surface: Surface) -> Any:
     """Set the mesh of a role's model; returns the node."""
     host.check_thread()
     node = scene.find_or_create(role)
-    node.SetAndObservePolyData(surface.to_polydata())
+    mesh = surface.to_polydata()
+    node.SetAndObservePolyData(mesh)
+    _surfaces[role] = (mesh, mesh.GetMTime(), surface)
     return node
 
 
@@ -147,7 +150,11 @@ def get_surface(role: str) -> Surface:
     mesh = _node(role).GetPolyData()
     if mesh is None or mesh.GetNumberOfPoints() == 0:
         raise InputError(f"{role} in the scene holds no surface; make it first")
-    return Surface.from_polydata(mesh)
+    kept, stamp, surface = _surfaces.get(role, (None, 0, None))
+    if surface is None or kept is not mesh or stamp != mesh.GetMTime():
+        surface = Surface.from_polydata(mesh)
+        _surfaces[role] = (mesh, mesh.GetMTime(), surface)
+    return surface
 
 
 def set_volume(role: str, volume: Volume) -> Any:
@@ -155,10 +162,10 @@ def set_volume(role: str, volume: Volume) -> Any:
     host.check_thread()
     node, util = scene.find_or_create(role), host.slicer_package().util
     node.SetIJKToRASMatrix(util.vtkMatrixFromArray(volume.ijk_to_ras))
-    util.updateVolumeFromArray(node, np.ascontiguousarray(volume.hu))
     node.CreateDefaultDisplayNodes()
     display = node.GetDisplayNode()
-    display.AutoWindowLevelOff()
+    display.AutoWindowLevelOff()  # before there are voxels: their histogram takes half a second, and nobody wants it
+    util.updateVolumeFromArray(node, np.ascontiguousarray(volume.hu))
     display.SetWindowLevel(2000.0, 400.0)  # the bone window of radiology, wide enough for the scalp to be seen
     display.SetAndObserveColorNodeID("vtkMRMLColorTableNodeGrey")
     node.SetDescription(volume.description)

@@ -115,6 +115,11 @@ class Surface:
         )
         return scene
 
+    def prepare(self) -> None:
+        """Make now what is otherwise made on first use and takes seconds for a skull: where that disturbs nobody."""
+        self.vertex_normals  # noqa: B018
+        self.closest(self.vertices_mm[:1])
+
     def closest(self, points_mm: npt.ArrayLike) -> ClosestPoints:
         """Exact closest points on the triangles for points (N, 3) in RAS."""
         points = np.asarray(points_mm, dtype=float).reshape(-1, 3)

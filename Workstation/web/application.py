@@ -102,6 +102,7 @@ class WorkstationApp(TrameApp):
     def _use_folder(self) -> None:
         """The modules write into the session's folder unless the user says otherwise."""
         self.logics[TRACKING].parameters().change(calibration_folder=str(self.session.folder))
+        self.logics[TRACKING].parameters().change(calibration_folder=str(self.session.folder))
         self.logics[ULTRASOUND].parameters().change(recording_path=self.session.recording_path)
         self.logics[REGISTRATION].parameters().change(output_folder=str(self.session.folder))
 
@@ -202,6 +203,8 @@ class WorkstationApp(TrameApp):
 
     def _save(self) -> None:
         try:
+            if self.logics[TRACKING].stream is not None:  # a calibration is written into it at once
+                self.session.folder.mkdir(parents=True, exist_ok=True)
             volume = self.session.ct_to_write()
             if volume is not None:
                 self.runner.start(lambda: self.session.write_ct(volume), _raise_if_failed)

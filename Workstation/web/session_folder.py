@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from CranioNavLib import host, scene, scene_data
 from CranioNavLib.errors import InputError
 from CranioNavLib.files import output_folder, write_text
@@ -22,6 +23,8 @@ LISTS = {
     "TargetsPatient": "targets-patient.mrk.json",
     "PlausibilityPoints": "plausibility.mrk.json",
 }
+PATHS = ("_path", "_folder")  # how parameters that name files end
+TABLES = ("Residuals", "TargetErrors")
 REGISTRATION_ATTRIBUTES = (scene.STATUS_ATTRIBUTE, scene_data.MOTION_ERROR)
 SHOWN_AS = "session"  # what the page shows in place of the folder's path
 
@@ -52,6 +55,7 @@ class SessionFolder:
     def __init__(self, folder: Path, parameter_nodes: Callable[[], Iterable[Any]]) -> None:
         self.folder, self._parameter_nodes = Path(folder), parameter_nodes
         self.simulated_seed: int | None = None
+        self.reported = False  # whether the report in the folder is of the registration in force
         self._written: dict[str, str] = {}
         self._ct_image: Any = None
         self._ct_pending = False  # the CT is not in the folder yet: nothing to go on from
@@ -59,9 +63,8 @@ class SessionFolder:
 
     @property
     def recording_path(self) -> str:
-        """Where the next palpation is recorded by default; an earlier one is not written over."""
-        names = [RECORDING, *(f"palpation-{number}.igs.mha" for number in range(2, 100))]
-        return str(self.folder / next(name for name in names if not (self.folder / name).exists()))
+        """Where palpation is recorded, and where `cranionav register` reads it: always the latest; earlier ones are set aside."""
+        return str(self.folder / RECORDING)
 
     def shown(self, text: str) -> str:
         """A text for the page: the folder's own path is not told."""
@@ -121,6 +124,10 @@ class SessionFolder:
             "bone": scene.find("OuterTable") is not None,
             "planned": scene.find("ProtocolPoints") is not None,
             "points": scene.find("SurfacePoints") is not None,
+            "asked_for": self._asked_for(),
+            "tables": {role: scene_data.get_table(role) for role in TABLES if scene.find(role) is not None},
+            "registered_points": self._registered_points(),
+            "reported": self.reported,
             "parameters": {
                 node.GetName(): {name: node.GetParameter(name) for name in node.GetParameterNames()}
                 for node in self._parameter_nodes()
@@ -134,8 +141,19 @@ class SessionFolder:
             },
         }
 
-    def read_state(self) -> dict[str, Any]:
-        """What `save` wrote.
+    def _asked_for(self) -> int:
+        node = scene.find("Protocol")
+        return int(node.GetParameter("current") or 0) if node is not None else 0
+
+    def _registered_points(self) -> dict[str, Any] | None:
+        node = scene.find("RegisteredPoints")
+        if node is None or not node.GetNumberOfControlPoints():
+            return None
+        points = scene_data.get_points("RegisteredPoints")
+        return {"labels": list(points.labels), "positions_mm": points.positions_mm.tolist()}
+
+    def read_state(self, folder: Path) -> dict[str, Any]:
+        """What `save` wrote into a folder.
 
         Raises
         ------
@@ -143,14 +161,14 @@ class SessionFolder:
             There is no such file, or it cannot be read.
         """
         try:
-            state: dict[str, Any] = json.loads((self.folder / STATE_FILE).read_text(encoding="utf-8"))
+            state: dict[str, Any] = json.loads((folder / STATE_FILE).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise InputError(f"the session cannot be read: {error}; begin a new one") from None
         return state
 
-    def read_lists(self) -> dict[str, LabelledPoints]:
-        """The point lists in the folder, by role."""
-        return {role: read_points(self.folder / name) for role, name in LISTS.items() if (self.folder / name).is_file()}
+    def read_lists(self, folder: Path) -> dict[str, LabelledPoints]:
+        """The point lists in a folder, by role."""
+        return {role: read_points(folder / name) for role, name in LISTS.items() if (folder / name).is_file()}
 
     def restore_parameters(self, state: dict[str, Any]) -> None:
         """Give the modules' parameter nodes what they held. Main thread only."""
@@ -158,6 +176,14 @@ class SessionFolder:
             with host.slicer_package().util.NodeModify(node):
                 for name, value in state["parameters"].get(node.GetName(), {}).items():
                     node.SetParameter(name, value)
+
+    def correct_paths(self, folder: Path) -> None:
+        """Paths into the session's folder hold after it was moved to another place, too."""
+        for node in self._parameter_nodes():
+            for name in node.GetParameterNames():
+                value = node.GetParameter(name)
+                if name.endswith(PATHS) and value and not Path(value).exists() and (folder / Path(value).name).exists():
+                    node.SetParameter(name, str(folder / Path(value).name))
 
     def restore_registration(self, state: dict[str, Any]) -> None:
         """Set ReferenceToRas with its status, and the results. Main thread only."""
@@ -171,3 +197,9 @@ class SessionFolder:
                 node.SetAttribute(name, value)
         if kept["results"]:
             scene_data.set_table("Results", kept["results"])
+        for role, columns in state.get("tables", {}).items():
+            scene_data.set_table(role, columns)
+        points = state.get("registered_points")
+        if points:
+            scene_data.set_points("RegisteredPoints", LabelledPoints(tuple(points["labels"]), np.array(points["positions_mm"])))
+        self.reported = bool(state.get("reported"))

@@ -69,25 +69,34 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
     def resumeSession(self) -> Task:
         """Read the session; the bone comes from the cache, the points from the recording."""
-        from ModuleRegistrationLib.anatomy.ct_reader import read_ct
-        from ModuleRegistrationLib.anatomy.segmentation import segment_bone
-
-        assert self._resumable is not None  # or it is blocked
-        self.session.folder = self._resumable
-        state, lists = self.session.read_state(), self.session.read_lists()
+        folder = self._resumable
+        assert folder is not None  # or it is blocked
+        state, lists = self.session.read_state(folder), self.session.read_lists(folder)
+        self.session.restore_parameters(state)
+        self.session.correct_paths(folder)
+        wanted = self._logics["ModuleRegistration"].parameters().read()
+        recorded = state["points"] and Path(self._logics["ModuleUltrasound"].parameters().read().recording_path).is_file()
+        measuring = self._logics["ModuleUltrasound"].measureRecording() if recorded else None
 
         def read(progress: Progress) -> Any:
+            from ModuleRegistrationLib.anatomy.ct_reader import read_ct
+            from ModuleRegistrationLib.anatomy.segmentation import segment_bone
+
+            from ModuleRegistration import prepared
+
             progress("reading the CT", 0.1)
-            volume = read_ct(self.session.folder / "ct.nrrd")
-            progress("finding the bone", 0.4)
-            bone = segment_bone(volume) if state["bone"] else None
+            volume = read_ct(folder / "ct.nrrd")
+            progress("finding the bone", 0.3)
+            bone = prepared(segment_bone(volume, method=wanted.segmentation)) if state["bone"] else None
+            progress("measuring the recording", 0.6)
+            points = measuring.compute(Progress()) if measuring is not None else None
             patient = None
             if state["simulated_seed"] is not None:
-                progress("laying the simulated patient on the table", 0.7)
+                progress("laying the simulated patient on the table", 0.8)
                 patient = _simulated_session(state["simulated_seed"])
-            return state, lists, volume, bone, patient
+            return volume, bone, patient, (lambda: measuring.apply(points)) if measuring is not None else None
 
-        return Task("Go on with the last session", read, lambda found: self._bring_back(*found))
+        return Task("Go on with the last session", read, lambda found: self._bring_back(folder, state, lists, *found))
 
     def resumeSessionBlocked(self) -> str:
         """Why there is nothing to go on with."""
@@ -95,25 +104,29 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
             return "a session is under way"
         return "" if self._resumable is not None else "no earlier session"
 
-    def _bring_back(self, state: dict[str, Any], lists: Any, volume: Any, bone: Any, patient: Any) -> str:
-        registration = self._logics["ModuleRegistration"]
+    def _bring_back(
+        self, folder: Path, state: dict[str, Any], lists: Any, volume: Any, bone: Any, patient: Any, take: Any
+    ) -> str:
+        registration, ultrasound = self._logics["ModuleRegistration"], self._logics["ModuleUltrasound"]
+        self.session.folder = folder
         registration.takeCt(volume)
         if bone is not None:
             registration._takeBone(bone)
         for role, points in lists.items():
             scene_data.set_points(role, points)
-        self.session.restore_parameters(state)
         if patient is not None:
             from CranioNavLib.phantom.session import use_session
 
             use_session(patient)
             self.session.simulated_seed = state["simulated_seed"]
-        ultrasound = self._logics["ModuleUltrasound"]
         if state["planned"] and bone is not None:
             ultrasound.planProtocol()
-        if state["points"] and Path(ultrasound.parameters().read().recording_path).is_file():
-            ultrasound.measureRecording().run()
+            ultrasound._goTo(int(state.get("asked_for", 0)))
+        if take is not None:
+            take()
         self.session.restore_registration(state)
+        if self.session.reported:
+            self._report_of = json.dumps(scene_data.get_transform("ReferenceToRas").tolist())
         self._go_to(state["step"])
         return "the session goes on where it was; connect the devices again"
 
@@ -154,6 +167,7 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
     def _report_written(self, difference_mm: float) -> str:
         self._report_of = json.dumps(scene_data.get_transform("ReferenceToRas").tolist())
+        self.session.reported = True
         if difference_mm > SAME_MM:
             return f"written; settings differ from the defaults, so the report's registration lies {difference_mm:.2f} mm off"
         return "written; the registration from the files is the one on the screen"

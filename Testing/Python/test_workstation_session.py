@@ -1,0 +1,149 @@
+"""A session that is killed at any step goes on exactly where it was."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from CranioNavLib import host, scene_data
+from CranioNavLib.files import set_aside
+from CranioNavLib.panel_model import PanelModel
+from CranioNavLib.slicer_files import LabelledPoints
+
+from Workstation.web.session_folder import SessionFolder
+
+SAME = ("ModuleRegistration", "ModuleUltrasound", "Session")  # panels whose read-outs and states must be as before
+OF_A_CONNECTION = ("connection", "probePose", "depth", "quality", "guidance")
+
+
+class Workstation:
+    """The logics on one scene, as the page has them."""
+
+    def __init__(self, folder: Any) -> None:
+        from Workstation.web.application import _modules
+
+        host.scene().Clear(False)
+        self.logics: dict[str, Any] = {}
+        self.models: dict[str, PanelModel] = {}
+        self.step = "ct"
+        self.session = SessionFolder(folder, lambda: [logic.parameters().node for logic in self.logics.values()])
+        for panel, logic in _modules(self.session, self.logics, self.go_to):
+            self.logics[panel.module] = logic
+            self.models[panel.module] = PanelModel(panel, logic)
+        self.logics["ModuleUltrasound"].parameters().change(recording_path=self.session.recording_path)
+
+    def go_to(self, step: str) -> None:
+        self.step = step
+
+    def do(self, module: str, action: str) -> str:
+        model = self.models[module]
+        assert model.run(next(one for one in model.panel.actions() if one.name == action)), model.message.text
+        return model.message.text
+
+    def keep(self) -> None:
+        volume = self.session.ct_to_write()
+        if volume is not None:
+            self.session.write_ct(volume)
+        self.session.save(self.step)
+
+    def seen(self) -> dict[str, Any]:
+        """What the panels show of the work, devices left out."""
+        from Workstation.web.panel_state import panel_state
+
+        found = {}
+        for name in SAME:
+            state = panel_state(self.models[name])
+            readings = {key: value for key, value in state["readings"].items() if key not in OF_A_CONNECTION}
+            steps = {key: value for key, value in state["status"].items() if key not in ("device", "palpation")}
+            found[name] = {"readings": readings, "status": steps, "fields": state["fields"]}
+        return found
+
+
+@pytest.fixture
+def a_recorded_patient(tmp_path, monkeypatch):
+    """A simulated patient on the synthetic head, with a recording of his palpation."""
+    monkeypatch.setenv("CRANIONAV_SIMULATED_HEAD", "synthetic")
+    from Workstation.demo_case import make_case
+
+    return make_case(None, seed=0, folder=tmp_path / "recorded")
+
+
+@pytest.mark.slow
+def test_a_session_killed_at_any_step_goes_on_exactly_where_it_was(a_recorded_patient, tmp_path):
+    import shutil
+
+    from CranioNavLib.case import read_case
+
+    folder, case = tmp_path / "session", read_case(a_recorded_patient)
+
+    def palpate(one: Workstation) -> None:
+        shutil.copy(a_recorded_patient / "palpation.igs.mha", folder / "palpation.igs.mha")
+        one.do("ModuleUltrasound", "measureRecording")
+
+    steps = [
+        ("ct", lambda one: one.do("SimulatedHand", "layPatient")),
+        ("bone", lambda one: one.do("ModuleRegistration", "segmentBone")),
+        ("landmarks", lambda one: scene_data.set_points("LandmarksPatient", case.landmarks_patient)),
+        ("landmarks", lambda one: one.do("ModuleRegistration", "registerLandmarks")),
+        ("ultrasound", lambda one: (one.do("ModuleUltrasound", "planProtocol"), one.do("ModuleUltrasound", "nextPoint"))),
+        ("ultrasound", palpate),
+        ("ultrasound", lambda one: one.do("ModuleRegistration", "registerSurface")),
+        ("verification", lambda one: (one.do("SimulatedHand", "measureTargets"), one.do("ModuleRegistration", "verify"))),
+    ]
+    running = Workstation(folder)
+    for step, work in steps:
+        running.step = step
+        work(running)
+        running.keep()
+        expected = running.seen()
+        running = Workstation(folder)
+        assert "the session goes on" in running.do("Session", "resumeSession")
+        assert running.step == step
+        assert running.seen() == expected
+    assert scene_data.get_points("RegisteredPoints").labels
+
+
+def test_an_earlier_recording_is_set_aside_under_a_number(tmp_path):
+    path = tmp_path / "palpation.igs.mha"
+    assert set_aside(path) is None
+    for number in (1, 2):
+        path.write_text(str(number))
+        assert set_aside(path) == tmp_path / f"palpation-{number}.igs.mha"
+    assert (tmp_path / "palpation-1.igs.mha").read_text() == "1"
+    assert not path.exists()
+
+
+def test_a_session_that_was_moved_finds_its_own_files(tmp_path):
+    here, there = tmp_path / "here", tmp_path / "there"
+    there.mkdir()
+    (there / "palpation.igs.mha").write_text("")
+    running = Workstation(here)
+    running.session.correct_paths(there)
+    assert running.logics["ModuleUltrasound"].parameters().read().recording_path == str(there / "palpation.igs.mha")
+
+
+def test_a_damaged_session_is_refused_and_nothing_is_changed(tmp_path):
+    folder = tmp_path / "session"
+    folder.mkdir()
+    (folder / "session.json").write_text("{")
+    running = Workstation(folder)
+    model = running.models["Session"]
+    assert not model.run(next(one for one in model.panel.actions() if one.name == "resumeSession"))
+    assert "cannot be read" in model.message.text
+    assert running.logics["ModuleRegistration"].ctStatus().text == "load the head CT"
+
+
+def test_what_was_verified_is_kept(tmp_path):
+    from CranioNavLib.volume import Volume
+
+    running = Workstation(tmp_path)
+    scene_data.set_volume("CT", Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), "nothing"))
+    scene_data.set_transform("ReferenceToRas", np.eye(4)).SetAttribute("CranioNav.Status", "accepted")
+    scene_data.set_table("TargetErrors", {"target": ["a"], "TRE (mm)": [1.5]})
+    scene_data.set_points("RegisteredPoints", LabelledPoints(("p",), np.array([[1.0, 2, 3]])))
+    running.keep()
+    state = json.loads((tmp_path / "session.json").read_text())
+    assert state["tables"]["TargetErrors"] == {"target": ["a"], "TRE (mm)": [1.5]}
+    assert state["registered_points"] == {"labels": ["p"], "positions_mm": [[1.0, 2.0, 3.0]]}
