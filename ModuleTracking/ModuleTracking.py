@@ -67,6 +67,7 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         super().__init__(parent)
         self.stream = None
         self._recorder = None
+        self._sharing = None
         self._tips = {}  # tool name -> [(time in s, ToolToReference)] of the last frames
         self._calibrator = ToolCalibrator()
         self._base = BaseWatch()
@@ -92,6 +93,7 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
     def disconnect(self):
         """Stop tracking; every tool is missing from now on."""
         self.stopRecording()
+        self.stopSharing()
         self.cancelPivot()
         if self.stream is not None:
             self.stream.stop()
@@ -119,6 +121,8 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         self._writeStale()
         if self._recorder is not None:
             self._recorder.add_frames(frames)
+        if self._sharing is not None:
+            self._share(frames)
         self._finishCalibration()
         self._watchBase()
 
@@ -354,6 +358,39 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
     def stopRecordingBlocked(self):
         """Why there is no recording to stop."""
         return "" if self._recorder is not None else "not recording"
+
+    # Sharing
+
+    def startSharing(self):
+        """Serve what is tracked over OpenIGTLink, on this computer only. Returns a message."""
+        from ModuleTrackingLib.sharing import Sharing
+
+        self._sharing = Sharing(self.parameters().read().share_port)
+        return f"OpenIGTLink at {self._sharing.address}"
+
+    def startSharingBlocked(self):
+        """Why nothing can be shared now."""
+        return self._notConnected() or ("already shared" if self._sharing is not None else "")
+
+    def stopSharing(self):
+        """Close the server."""
+        if self._sharing is not None:
+            self._sharing.close()
+            self._sharing = None
+
+    def stopSharingBlocked(self):
+        """Why there is no server to close."""
+        return "" if self._sharing is not None else "not shared"
+
+    def _share(self, frames):
+        self._sharing.add_frames(frames)
+        node = scene.find("ReferenceToRas")
+        registered = node is not None and bool(node.GetAttribute(scene.STATUS_ATTRIBUTE))
+        self._sharing.add_transform("ReferenceToRas", scene_data.get_transform("ReferenceToRas") if registered else None)
+
+    def sharing(self):
+        """Who listens."""
+        return Reading(self._sharing.words(), Level.GOOD) if self._sharing is not None else None
 
     # What the panel shows
 

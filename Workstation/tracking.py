@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from CranioNavLib.device_stream import CONNECTING
 from CranioNavLib.errors import InputError
 from ModuleTrackingLib.pose_csv import PoseCsvWriter
 from ModuleTrackingLib.pose_stream import PoseStream
@@ -129,7 +130,7 @@ def listen(tracker: Tracker, seconds: float, timeout_s: float) -> dict[str, Any]
     """
     tally = _Tally()
     with PoseStream(tracker) as stream, live_table(stream) as redraw:
-        _connect(stream, timeout_s)
+        connect(stream, timeout_s)
         begin = time.monotonic()
         while time.monotonic() - begin < seconds:
             tally.add(stream.poll())
@@ -164,16 +165,16 @@ def record_session(
     with contextlib.ExitStack() as stack:
         stream = stack.enter_context(PoseStream(tracker))
         redraw = stack.enter_context(live_table(stream))
-        interrupted = stack.enter_context(_interruption())
-        _connect(stream, timeout_s, interrupted)
+        interrupted = stack.enter_context(interruption())
+        connect(stream, timeout_s, interrupted)
         table = stack.enter_context(PoseCsvWriter(csv)) if csv is not None else None
         recorder = stack.enter_context(SessionRecorder(output, stream)) if output is not None and device is None else None
         if device is not None:
-            _open(device, stack)
+            open_device(device, stack)
         begin = time.monotonic()
         frames_in_table = 0
         while not interrupted and (seconds is None or time.monotonic() - begin < seconds):
-            line = _read(device)
+            line = read_device(device)
             frames = stream.poll()
             if recorder is None and line is not None and output is not None and device is not None:
                 recorder = stack.enter_context(SessionRecorder(output, stream, device.acquisition, len(line.samples)))
@@ -207,23 +208,36 @@ def record_session(
     }
 
 
-def _connect(stream: PoseStream, timeout_s: float, interrupted: list[int] | None = None) -> None:
+def connect(stream: PoseStream, timeout_s: float, interrupted: list[int] | None = None) -> None:
+    """Wait until the tracker is connected.
+
+    Raises
+    ------
+    InputError
+        It cannot be had, or not in time.
+    """
     deadline = time.monotonic() + timeout_s
     while not stream.state.connected and not interrupted:
         stream.poll()
+        if not stream.state.connected and stream.state.problem != CONNECTING:  # drivers are patient by themselves
+            raise InputError(f"{stream.tracker.name}: {stream.state.problem}")
         if time.monotonic() > deadline:
-            raise InputError(f"{stream.tracker.name}: no connection in {timeout_s:g} s: {stream.state.problem}")
-        time.sleep(TURN_S)
+            raise InputError(
+                f"{stream.tracker.name}: no connection in {timeout_s:g} s; check the device, or wait longer: --timeout"
+            )
+        stream.wait(TURN_S)
 
 
-def _open(device: AModeDevice, stack: contextlib.ExitStack) -> None:
+def open_device(device: AModeDevice, stack: contextlib.ExitStack) -> None:
+    """Open and start an A-mode device; the stack closes it."""
     try:
         stack.enter_context(device)
     except DeviceError as error:
         raise InputError(f"{device.name}: {error}") from None
 
 
-def _read(device: AModeDevice | None) -> Any:
+def read_device(device: AModeDevice | None) -> Any:
+    """The device's next line, or None."""
     if device is None:
         return None
     try:
@@ -233,7 +247,7 @@ def _read(device: AModeDevice | None) -> Any:
 
 
 @contextlib.contextmanager
-def _interruption() -> Iterator[list[int]]:
+def interruption() -> Iterator[list[int]]:
     """A list that is no longer empty once the user or the system asked to end; the files are then finished in order."""
     asked: list[int] = []
     before = {name: signal.signal(name, lambda number, _: asked.append(number)) for name in (signal.SIGINT, signal.SIGTERM)}

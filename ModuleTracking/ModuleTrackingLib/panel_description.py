@@ -39,6 +39,7 @@ class TrackingParameters(Parameters):
     rest_s: Annotated[float, Limits(0.1, 10), "how long the tip must rest on a point"] = 0.7
     pivot_s: Annotated[float, Limits(1, 120), "how long the tool is pivoted for its calibration"] = 10.0
     calibration_folder: Annotated[str, "folder that keeps calibrations and the check point"] = ""
+    share_port: Annotated[int, Limits(0, 65535), "TCP port of the OpenIGTLink server; 0: a free one"] = 18944
     recording_path: Annotated[str, "recording of all tools (.igs.mha)"] = ""
 
 
@@ -110,6 +111,17 @@ PANEL = Panel(
                 NodeField("PlausibilityPoints", "Plausibility"),
             ),
             status="pointsStatus",
+        ),
+        Step(
+            name="sharing",
+            title="Sharing",
+            help="Poses and registration for 3D Slicer or any other OpenIGTLink client on this computer.",
+            items=(
+                ParameterField("share_port", "Port"),
+                Action("startSharing", "Share", "Serve OpenIGTLink", primary=True),
+                Action("stopSharing", "Stop sharing", "Close the server"),
+                ReadOut("sharing", "Shared with"),
+            ),
         ),
         Step(
             name="recording",

@@ -12,6 +12,7 @@ from CranioNavLib.device_plugin import DevicePlugin
 from CranioNavLib.errors import InputError
 
 READ_S = 0.1
+CONNECTING = "connecting"  # the problem of a stream that has just been started
 RETRY_S = 0.5  # a device that returns is found again well within 2 s
 SWITCH_S = 0.001  # Python lets a busy thread go on for 5 ms otherwise: at 250 Hz a frame is gone after 4
 
@@ -41,7 +42,7 @@ class DeviceStream(ABC):
         """Begin reading; returns at once, `state` tells when the device is connected."""
         if self._thread is None:
             self._stopping.clear()
-            self._problem = "connecting"
+            self._problem = CONNECTING
             sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_S))
             self._thread = threading.Thread(target=self._run, name=self._thread_name, daemon=True)
             self._thread.start()

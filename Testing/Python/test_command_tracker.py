@@ -172,6 +172,27 @@ def test_a_lines_are_recorded_with_their_poses(capsys, a_table, tmp_path):
     np.testing.assert_array_equal(SimpleITK.GetArrayFromImage(image)[:, 0], recording.lines)
 
 
+def test_what_a_tracker_sees_is_served_to_a_foreign_client(a_table):
+    pyigtl = pytest.importorskip("pyigtl")
+    command = cranionav("tracker", "serve", "replay", "-s", f"path={a_table}", "--port", "0", "--amode", "simulated")
+    process = subprocess.Popen(
+        [*command, "--amode-set", "head=synthetic"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        address = process.stdout.readline().strip()
+        assert address, process.stderr.read()
+        client = pyigtl.OpenIGTLinkClient("127.0.0.1", int(address.rsplit(":", 1)[1]))
+        pose = client.wait_for_message("ProbeToReference", timeout=20)
+        line = client.wait_for_message("ALine", timeout=20)
+        client.stop()
+    finally:
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20) == 0
+    np.testing.assert_allclose(pose.matrix, PROBE_TO_REFERENCE, atol=1e-3)
+    assert line.image.shape[:2] == (1, 1)
+    assert line.image.dtype == np.int16
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -182,8 +203,9 @@ def test_a_lines_are_recorded_with_their_poses(capsys, a_table, tmp_path):
         (["probe", "replay", "-s", "pace=2"], "unknown parameter 'pace'"),
         (
             ["probe", "openigtlink", "-s", "port=1", "-s", "connect_timeout_s=0.3", "--timeout", "1"],
-            "no connection in 1 s: OpenIGTLink: 127.0.0.1:1: connection refused",
+            "openigtlink: OpenIGTLink: 127.0.0.1:1: connection refused",
         ),
+        (["probe", "polaris", "-s", "port=/dev/none"], "polaris: there is no port /dev/none; plug the tracker in"),
         (["record", "replay", "-s", "path=none.csv"], "nothing to record to"),
         (["record", "replay", "-s", "path={table}", "--csv", "{tmp}/none/a.csv", "--seconds", "1"], "choose a folder"),
         (["record", "replay", "-s", "path={table}", "-o", "{tmp}/a.nrrd", "--seconds", "1"], "written as .igs.mha"),

@@ -109,6 +109,31 @@ def record(
         print(f"{file}: {report['frames']} frames in {report['duration_s']:.1f} s")
 
 
+@app.command("serve")
+def serve(
+    name: Name,
+    set_: Set = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0 takes a free one")] = 18944,
+    host: Annotated[
+        str, typer.Option(help="address to serve at; others than this computer's own loopback only if you say so")
+    ] = ("127.0.0.1"),
+    seconds: Annotated[Optional[float], typer.Option(min=0.1, help="length; without it until Ctrl-C")] = None,
+    amode: Annotated[
+        Optional[str], typer.Option("--amode", metavar="NAME", help="A-mode device whose lines are served too")
+    ] = None,
+    amode_set: Annotated[
+        Optional[list[str]], typer.Option("--amode-set", metavar="PARAMETER=VALUE", help="a parameter of that device")
+    ] = None,
+    timeout: Annotated[float, typer.Option(min=0.5, help="longest wait for the connection, in s")] = 30.0,
+) -> None:
+    """Serve poses, and A-lines, over OpenIGTLink to 3D Slicer and others; the first line on stdout is the address."""
+    from Workstation.sharing import serve_session
+    from Workstation.tracking import make_device, make_tracker
+
+    device = make_device(amode, amode_set or []) if amode is not None else None
+    serve_session(make_tracker(name, set_ or []), device, host, port, seconds, timeout)
+
+
 @app.command("recover")
 def recover_recording(
     recording: Annotated[Path, typer.Argument(metavar="FILE.igs.mha", help="the recording that was interrupted")],

@@ -20,7 +20,7 @@ HAND, SESSION, NAVIGATION = "SimulatedHand", "Session", "Navigation"
 PROCEDURE: tuple[ProcedureStep, ...] = (
     ProcedureStep("ct", "CT", ((SESSION, "resume"), (HAND, "patient"), (REGISTRATION, "ct"))),
     ProcedureStep("bone", "Bone and landmarks", ((REGISTRATION, "bone"), (REGISTRATION, "plan"))),
-    ProcedureStep("devices", "Devices", ((TRACKING, "tracker"), (ULTRASOUND, "device"))),
+    ProcedureStep("devices", "Devices", ((TRACKING, "tracker"), (ULTRASOUND, "device"), (TRACKING, "sharing"))),
     ProcedureStep("calibration", "Calibration", ((HAND, "pivot"), (TRACKING, "calibration"), (TRACKING, "base"))),
     ProcedureStep("landmarks", "Landmarks", ((HAND, "landmarks"), (TRACKING, "points"), (REGISTRATION, "landmarks"))),
     ProcedureStep(

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import time
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from CranioNavLib import host, scene, scene_data
 from CranioNavLib.errors import InputError
+from CranioNavLib.openigtlink import IgtlClient
+from CranioNavLib.openigtlink.messages import Transform
 from CranioNavLib.panel import Level, StepState
 from CranioNavLib.parameters import Parameters
 from CranioNavLib.rigid import invert_rigid, rigid, rigid_from_vector
@@ -375,3 +378,27 @@ def test_a_rolled_tool_gets_its_axis(a_logic):
     np.testing.assert_allclose(found.tool_to_marker[:3, 3], TIP, atol=1e-6)
     run_for(a_logic, 0.1)
     np.testing.assert_allclose(scene_data.get_transform("StylusToReference")[:3, 3], DIVOT, atol=1e-6)
+
+
+def test_what_is_tracked_and_registered_is_shared_with_openigtlink_clients(a_logic):
+    a_logic.connect()
+    run_until(a_logic, seen())
+    a_logic.parameters().change(share_port=0)
+    address = a_logic.startSharing().split()[-1]
+    scene_data.set_transform("ReferenceToRas", BASE)
+    heard = {}
+    with closing(IgtlClient("127.0.0.1", int(address.rsplit(":", 1)[1]))) as client:
+
+        def listen():
+            heard.update({message.device: message.matrix for message in client.receive(0.001) if isinstance(message, Transform)})
+            return {"StylusToReference", "StylusToTracker", "ReferenceToTracker"} <= heard.keys()
+
+        run_until(a_logic, listen)
+        assert "1 client" in a_logic.sharing().text
+        assert "ReferenceToRas" not in heard  # not registered yet
+        scene.find("ReferenceToRas").SetAttribute(scene.STATUS_ATTRIBUTE, "accepted")
+        run_until(a_logic, lambda: listen() and "ReferenceToRas" in heard)
+    np.testing.assert_allclose(heard["StylusToReference"][:3, 3], DIVOT, atol=1e-4)
+    np.testing.assert_allclose(heard["ReferenceToRas"], BASE, atol=1e-4)
+    a_logic.disconnect()
+    assert a_logic.sharing() is None
