@@ -20,7 +20,7 @@ from Workstation.web.background import BackgroundRunner
 from Workstation.web.drawings import drawings
 from Workstation.web.page import Page
 from Workstation.web.panel_view import PanelView
-from Workstation.web.procedure import HAND, NAVIGATION, PROCEDURE, REGISTRATION, SESSION, TRACKING, ULTRASOUND
+from Workstation.web.procedure import HAND, NAVIGATION, PROCEDURE, REGISTRATION, SESSION, TRACKING, ULTRASOUND, modules_of
 from Workstation.web.session_folder import SessionFolder, new_folder
 from Workstation.web.session_panel import SessionLogic
 from Workstation.web.session_windows import Windows
@@ -57,6 +57,7 @@ class WorkstationApp(TrameApp):
             key = panel.module.replace("Module", "").lower()
             model = PanelModel(panel, logic, self.runner)
             self.panels[panel.module] = PanelView(self.server, model, key, self.session.shown, self.session.meant, self._poll)
+        self._in_turn = itertools.cycle(self.panels)  # of panels that are not shown, one at a time is looked at
         self._use_folder()
         self.views, self.cues = ViewFollower(self.slicer), Cues()
         self.controls = ViewControls(self.server, self.layouts, self.views.fit)
@@ -153,8 +154,8 @@ class WorkstationApp(TrameApp):
                     state.live = drawings(self.logics[ULTRASOUND])
                 state.files = self.logics[SESSION].offered()
                 state.simulated = self._is_simulated()
-            for panel in self.panels.values():
-                panel.refresh()
+            for name in (*modules_of(self.server.state.step), next(self._in_turn)):
+                self.panels[name].refresh()
 
     def _keep(self, turn: int) -> None:
         """Save what is new; let go of windows that take nothing."""

@@ -144,7 +144,7 @@ class MovingPicture:
         self._window.GetZbufferData(0, 0, width - 1, height - 1, self._depths)
         pixels = vtk_to_numpy(self._pixels).reshape(height, width, 4)
         depths = vtk_to_numpy(self._depths).reshape(height, width)
-        rows, columns = np.nonzero(pixels[..., 3])
+        rows, columns = np.nonzero(pixels.view(np.uint32)[..., 0])  # the background is 0 in all four
         before = _before_the_eye(depths[rows, columns], camera) < still.depths[rows, columns]
         rows, columns = rows[before], columns[before]
         share = pixels[rows, columns, 3:].astype(np.float32) / 255.0

@@ -38,3 +38,8 @@ PROCEDURE: tuple[ProcedureStep, ...] = (
     ProcedureStep("navigation", "Navigation", ((NAVIGATION, "navigation"), (HAND, "tour"))),
     ProcedureStep("report", "Report and export", ((SESSION, "report"),)),
 )
+
+
+def modules_of(step: str) -> list[str]:
+    """The modules whose panels a step shows."""
+    return list(dict.fromkeys(module for one in PROCEDURE if one.name == step for module, _ in one.parts))
