@@ -35,10 +35,21 @@ PLAY = """
       tone.stop(begin + length + 0.02);
     }
   };
-  let heard = null;
+  let heard = null, muted = null, restoring = false;
+  const keepMuted = (now) => {  // each window's own choice, kept by its browser
+    const kept = window.localStorage.getItem('cranionav-muted');
+    if (muted === null) {
+      restoring = kept === 'true' && now !== 'true';
+      if (restoring) trame.state.set('muted', true);
+    } else if (restoring) restoring = now !== 'true';
+    else if (now !== kept) window.localStorage.setItem('cranionav-muted', now);
+    muted = now;
+  };
   setInterval(() => {
     const cue = document.querySelector('[data-cue]');
-    if (!cue || cue.dataset.count === heard) return;
+    if (!cue) return;
+    keepMuted(cue.dataset.muted);
+    if (cue.dataset.count === heard) return;
     const first = heard === null;
     heard = cue.dataset.count;
     if (first || cue.dataset.muted === 'true') return;
