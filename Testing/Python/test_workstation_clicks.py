@@ -101,7 +101,7 @@ def test_layouts_windows_sounds_and_help_by_keys(tmp_path):
         for key, count in (("3", 1), ("2", 4), ("6", 4), ("1", 4)):
             page.keyboard.press(key)
             page.wait_for_function("count => document.querySelectorAll('.layout-grid-item').length === count", arg=count)
-            assert page.locator(f'[data-layouts] [data-key="{key}"].v-btn--active').count() == 1
+            page.locator(f'[data-layouts] [data-key="{key}"].v-btn--active').wait_for()
         for shown in ("Brain", "Skin", "Bone"):
             page.keyboard.press("w")
             page.locator("[data-windows] .v-btn--active").filter(has_text=shown).wait_for()
@@ -119,7 +119,7 @@ def test_layouts_windows_sounds_and_help_by_keys(tmp_path):
         page.locator("[data-cue][data-played=refused]").wait_for(state="attached")
         page.keyboard.press("m")
         page.locator("[data-cue][data-muted=true]").wait_for(state="attached")
-        page.reload()  # the choice is the session's, not the page's
+        page.reload()  # the choice is kept
         page.locator("[data-cue][data-muted=true]").wait_for(state="attached")
         before = cue.get_attribute("data-count")
         user.press("ct", "loadCt")
