@@ -120,16 +120,6 @@ def test_a_blocked_action_says_why(an_empty_scene):
     assert "still missing" in view.server.state.panel["message"]["text"]
 
 
-def test_a_folder_of_the_session_is_not_told_to_the_page(an_empty_scene, tmp_path):
-    from Workstation.web.session_folder import SessionFolder
-
-    session = SessionFolder(tmp_path / "here", list)
-    path = str(tmp_path / "here" / "palpation.igs.mha")
-    assert session.shown(f"recording into {path}") == "recording into session/palpation.igs.mha"
-    assert session.meant("session/palpation.igs.mha") == path
-    assert session.meant("/data/other.igs.mha") == "/data/other.igs.mha"
-
-
 def test_a_point_added_to_a_list_is_saved(an_empty_scene, tmp_path):
     from CranioNavLib import scene
     from CranioNavLib.slicer_files import add_points, read_points

@@ -14,6 +14,10 @@ def workstation(
         Optional[Path],
         typer.Option(metavar="DIR", help="the session's folder; a case in it is loaded, an interrupted session goes on"),
     ] = None,
+    data: Annotated[
+        Optional[Path],
+        typer.Option(metavar="DIR", help="a folder of CTs that the page may choose from", exists=True, file_okay=False),
+    ] = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open the page")] = True,
     host: Annotated[str, typer.Option(help="another interface than loopback; its address then carries a token")] = "127.0.0.1",
 ) -> int:
@@ -23,5 +27,5 @@ def workstation(
     """
     from Workstation.web.server import serve
 
-    serve(port, case, browser, host)
+    serve(port, case, browser, host, data)
     return 0

@@ -21,6 +21,8 @@ from Workstation.web.drawings import drawings
 from Workstation.web.page import Page
 from Workstation.web.panel_view import PanelView
 from Workstation.web.procedure import HAND, NAVIGATION, PROCEDURE, REGISTRATION, SESSION, TRACKING, ULTRASOUND, modules_of
+from Workstation.web.session_files import Places
+from Workstation.web.session_files_view import FilesDialog
 from Workstation.web.session_folder import SessionFolder, new_folder
 from Workstation.web.session_panel import SessionLogic
 from Workstation.web.session_windows import Windows
@@ -39,7 +41,7 @@ LOG = logging.getLogger(__name__)
 class WorkstationApp(TrameApp):
     """Server side of the page. Everything that touches the scene runs in the event loop's thread."""
 
-    def __init__(self, server: Any = None, folder: Path | None = None) -> None:
+    def __init__(self, server: Any = None, folder: Path | None = None, data: Path | None = None) -> None:
         super().__init__(server)
         from trame_slicer import module as slicer_views
 
@@ -50,13 +52,14 @@ class WorkstationApp(TrameApp):
             self._make_views()
         self.runner = BackgroundRunner()
         self.session = SessionFolder(folder or new_folder(), self._parameter_nodes)
+        self.places = Places(self.session, data)
         self.logics: dict[str, Any] = {}
         self.panels: dict[str, PanelView] = {}
         for panel, logic in _modules(self.session, self.logics, self._go_to):
             self.logics[panel.module] = logic
             key = panel.module.replace("Module", "").lower()
             model = PanelModel(panel, logic, self.runner)
-            self.panels[panel.module] = PanelView(self.server, model, key, self.session.shown, self.session.meant, self._poll)
+            self.panels[panel.module] = PanelView(self.server, model, key, self.places.shown, self.places.meant, self._poll)
         self._in_turn = itertools.cycle(self.panels)  # of panels that are not shown, one at a time is looked at
         self._use_folder()
         self.views, self.cues = ViewFollower(self.slicer), Cues()
@@ -67,6 +70,7 @@ class WorkstationApp(TrameApp):
             [],
             False,
         )
+        self.files = FilesDialog(self.server, self.places, self._load_ct, self.runner.start)
         self.page = Page(self.server, self.panels, self.layouts, PROCEDURE)
         self.server.controller.on_server_ready.add_task(self._keep_fresh)
         self.server.controller.on_server_ready.add_task(self.painter.run)
@@ -81,6 +85,10 @@ class WorkstationApp(TrameApp):
         panel = self.panels[REGISTRATION]
         self.logics[REGISTRATION].parameters().change(case_folder=str(self.session.folder))
         panel.model.run(next(action for action in panel.model.panel.actions() if action.name == "loadCase"))
+
+    def _load_ct(self, path: str, series: str) -> None:
+        self.logics[REGISTRATION].parameters().change(ct_path=path, ct_series=series)
+        self.panels[REGISTRATION].run("loadCt")
 
     def _make_views(self) -> None:
         from trame_slicer.core import LayoutManager, SlicerApp

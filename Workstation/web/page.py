@@ -14,6 +14,7 @@ from Workstation.web.drawings_view import draw_live
 from Workstation.web.keyboard import draw_help
 from Workstation.web.panel_view import PanelView
 from Workstation.web.procedure import HAND, ProcedureStep
+from Workstation.web.session_files_view import draw_files
 from Workstation.web.session_link import draw_link
 from Workstation.web.sounds_view import draw_sounds
 from Workstation.web.toolbar import draw_toolbar
@@ -94,6 +95,8 @@ class Page:
                 with html.Div(v_show=f"step === '{step.name}'", classes="pa-4", raw_attrs=[f'data-panel="{step.name}"']):
                     html.Div(f"{number}  {step.title}", classes="text-h6 mb-2")
                     self._draw_what_next(step, after)
+                    if step.name == "ct":
+                        draw_files()
                     draw_live(step.name)
                     for module, name in step.parts:
                         view = self.panels[module]

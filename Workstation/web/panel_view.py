@@ -55,7 +55,7 @@ class PanelView:
         server.controller.trigger(f"{key}_change")(self._change)
         server.controller.trigger(f"{key}_setting")(self._change_setting)
         server.controller.trigger(f"{key}_pick")(self._pick)
-        server.controller.trigger(f"{key}_run")(self._run)
+        server.controller.trigger(f"{key}_run")(self.run)
         server.controller.trigger(f"{key}_cancel")(self.model.cancel)
 
     def refresh(self) -> None:
@@ -251,7 +251,8 @@ class PanelView:
         field = next(item for item in self.model.panel.items() if isinstance(item, ListField) and item.name == name)
         self.model.pick(field, entry)
 
-    def _run(self, name: str) -> None:
+    def run(self, name: str) -> None:
+        """Do what a button says, as if it had been pressed."""
         self._last = name
         self._before()
         self.model.run(next(action for action in self.model.panel.actions() if action.name == name))

@@ -9,11 +9,19 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from CranioNavLib.errors import InputError
+
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 COOKIE = "cranionav-token"
 
 
-def serve(port: int = 0, case: Path | None = None, open_browser: bool = True, host_name: str = "127.0.0.1") -> None:
+def serve(
+    port: int = 0,
+    case: Path | None = None,
+    open_browser: bool = True,
+    host_name: str = "127.0.0.1",
+    data: Path | None = None,
+) -> None:
     """Serve the workstation until interrupted; loopback unless another interface is named, which then asks for a token."""
     os.environ.setdefault("WSLINK_READY_MSG", "")  # the first line on stdout is the address
     os.environ.setdefault("WSLINK_WS_COMPRESS", "0")  # pictures are compressed already
@@ -26,12 +34,13 @@ def serve(port: int = 0, case: Path | None = None, open_browser: bool = True, ho
     from Workstation.web.application import WorkstationApp
     from Workstation.web.session_link import ALIVE
 
-    application = WorkstationApp(server, case)
+    application = WorkstationApp(server, case, data)
 
     def bound(web: Any) -> None:
         web.app.middlewares.append(_gate(token))
         web.app.router.add_get("/session/{name}", _file_of(application))
         web.app.router.add_get(f"/{ALIVE}", _alive_of(application.windows))
+        web.app.router.add_post("/upload", _upload_of(application))
         application.windows.guard(web)
 
     def ready(**_: Any) -> None:
@@ -97,6 +106,27 @@ def _alive_of(windows: Any) -> Any:
         return web.json_response({"boot": windows.boot, "open": windows.is_open(request.query.get("window", ""))})
 
     return answer
+
+
+def _upload_of(application: Any) -> Any:
+    """Takes a CT that the controlling window sends, into the session's folder."""
+    from aiohttp import web
+
+    async def take(request: Any) -> Any:
+        query = request.query
+        if not application.windows.holds_control(query.get("window", "")):
+            return web.Response(status=403, text="this window only watches; take control first")
+        try:
+            path = await application.places.receive(
+                query.get("folder", ""), query.get("name", ""), request.content.iter_chunked(2**18)
+            )
+        except InputError as error:
+            return web.Response(status=400, text=application.places.shown(str(error)))
+        except OSError as error:
+            return web.Response(status=400, text=f"it cannot be kept: {error.strerror}")
+        return web.Response(text=path)
+
+    return take
 
 
 def _file_of(application: Any) -> Any:

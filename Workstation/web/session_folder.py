@@ -26,7 +26,6 @@ LISTS = {
 PATHS = ("_path", "_folder")  # how parameters that name files end
 TABLES = ("Residuals", "TargetErrors")
 REGISTRATION_ATTRIBUTES = (scene.STATUS_ATTRIBUTE, scene_data.MOTION_ERROR)
-SHOWN_AS = "session"  # what the page shows in place of the folder's path
 
 
 def default_parent() -> Path:
@@ -65,14 +64,6 @@ class SessionFolder:
     def recording_path(self) -> str:
         """Where palpation is recorded, and where `cranionav register` reads it: always the latest; earlier ones are set aside."""
         return str(self.folder / RECORDING)
-
-    def shown(self, text: str) -> str:
-        """A text for the page: the folder's own path is not told."""
-        return text.replace(str(self.folder), SHOWN_AS)
-
-    def meant(self, text: str) -> str:
-        """The inverse, for what the page sends."""
-        return str(self.folder) + text[len(SHOWN_AS) :] if text == SHOWN_AS or text.startswith(SHOWN_AS + "/") else text
 
     def ct_to_write(self) -> Any | None:
         """The scene's CT (Volume), if the folder does not have it yet; write it with `write_ct`, in any thread."""

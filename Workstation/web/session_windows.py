@@ -77,6 +77,10 @@ class Windows(LinkProtocol):  # type: ignore[misc]
         number = self._numbers.get(name, 0)
         return any(connection.window == number for connection in self._connections.values()) and number > 0
 
+    def holds_control(self, name: str) -> bool:
+        """Whether the window of that name controls."""
+        return self.is_open(name) and self._numbers.get(name) == self._controller
+
     # The page's side
 
     @register(OPEN)  # type: ignore[untyped-decorator]

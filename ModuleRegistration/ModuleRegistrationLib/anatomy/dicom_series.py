@@ -72,6 +72,24 @@ def read_dicom(path: Path, series: Optional[str] = None) -> tuple[Any, str]:
     return _read_voxels(ordered, tilted, name), name
 
 
+def list_series(folder: Path) -> list[tuple[str, str]]:
+    """SeriesInstanceUID and description, for people, of every series in a folder that may be a CT of a head.
+
+    Raises
+    ------
+    InputError
+        No or damaged DICOM files, or none of a CT.
+    """
+    groups = _by_series(_read_headers(folder))
+    volumes = [group for group in groups if _is_ct(group) and len(group) >= FEWEST_SLICES]
+    if not volumes:
+        raise InputError(f"{folder} holds no CT, but {_listed(groups)}; choose another folder")
+    return [
+        (str(group[0].header.SeriesInstanceUID), f"{_describe(group) or 'series without a name'}, {len(group)} slices")
+        for group in volumes
+    ]
+
+
 def _read_headers(folder: Path) -> list[Slice]:
     pydicom: Any = importlib.import_module("pydicom")
     files = sorted(item for item in folder.rglob("*") if item.is_file() and not item.name.startswith("."))
