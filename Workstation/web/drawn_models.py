@@ -23,7 +23,8 @@ class CoarseCopy:
     """Stands in the views for the model of a role, which itself is hidden."""
 
     def __init__(self, role: str) -> None:
-        self._role, self._node = role, None
+        self._role = role
+        self._node: Any = None
         self._source: Any = None  # held, not only compared: VTK's wrappers of data that nobody holds are made anew
 
     @property
@@ -44,10 +45,11 @@ class CoarseCopy:
             return False
         self._source = source
         wanted = scene.role(self._role)
-        if self.node is None:
-            self._node = new_model(f"{self._role} as drawn", wanted.color or scene.BONE)
+        copy = self.node
+        if copy is None:
+            copy = self._node = new_model(f"{self._role} as drawn", wanted.color or scene.BONE)
             self._node.GetDisplayNode().SetOpacity(wanted.opacity)
-        self._node.SetAndObservePolyData(_coarse(source))
+        copy.SetAndObservePolyData(_coarse(source))
         model.GetDisplayNode().SetVisibility(False)
         return True
 

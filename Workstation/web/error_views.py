@@ -53,8 +53,8 @@ class ErrorViews:
             return False
         node = scene.find("SurfacePoints") if _landmarks_alone() else None
         taken = node.GetNumberOfControlPoints() if node is not None else 0
-        last = node.GetNthControlPointPosition(taken - 1) if taken else ()
-        motion = scene.find("ReferenceToRas").GetAttribute(scene_data.MOTION_ERROR)
+        last = node.GetNthControlPointPosition(taken - 1) if node is not None and taken else ()
+        motion = scene.find_or_create("ReferenceToRas").GetAttribute(scene_data.MOTION_ERROR)
         stamp = (mesh, motion, tuple(last), taken)
         if self._mapped == stamp:
             return True
@@ -136,7 +136,7 @@ def _landmarks_alone() -> bool:
     """Whether the registration in force is the landmarks', and no surface registration has judged the points yet."""
     from ModuleRegistrationLib.result_tables import QUANTITY, STATUS
 
-    if scene.find("ReferenceToRas").GetAttribute(scene.STATUS_ATTRIBUTE) != "landmarks":
+    if scene.find_or_create("ReferenceToRas").GetAttribute(scene.STATUS_ATTRIBUTE) != "landmarks":
         return False
     return scene.find("Results") is None or STATUS not in scene_data.get_table("Results").get(QUANTITY, [])
 

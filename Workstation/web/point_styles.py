@@ -22,7 +22,7 @@ class PointStyle:
 
 
 STYLES = {
-    "LandmarksCT": PointStyle(5.0, "Sphere3D", ("ct", "bone", "devices", "calibration", "landmarks")),
+    "LandmarksCT": PointStyle(5.0, "Sphere3D", ("bone", "devices", "calibration", "landmarks")),
     "LandmarksPatient": PointStyle(6.0, "ThickCross2D", ("landmarks",)),
     "TargetsCT": PointStyle(4.0, "Diamond2D", ("bone", *LATER)),
     "TargetsPatient": PointStyle(4.0, "ThickCross2D", ("verification",)),

@@ -52,7 +52,7 @@ class Cues:
 
 def pitch_of(tilt_deg: float) -> float:
     """The tone of a tilt: the higher the nearer to upright."""
-    return max(LOWEST_HZ, UPRIGHT_HZ * 2.0 ** (-abs(tilt_deg) / OCTAVE_DEG))
+    return max(LOWEST_HZ, UPRIGHT_HZ * float(2.0 ** (-abs(tilt_deg) / OCTAVE_DEG)))
 
 
 def situation(panels: dict[str, Any], ultrasound: Any, palpating: bool) -> Situation:

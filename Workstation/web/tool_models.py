@@ -38,7 +38,7 @@ class ToolModels:
             if not visible:
                 return
             node = self._models[tool] = moving_model(f"{tool} model", TOOLS[tool])
-            node.SetAndObserveTransformNodeID(scene.find(f"{tool}ToReference").GetID())
+            node.SetAndObserveTransformNodeID(scene.find_or_create(f"{tool}ToReference").GetID())
         if node.GetPolyData() is None or self._foreruns.get(tool) != forerun_mm:
             node.SetAndObservePolyData(tool_shape(*SHAPES[tool], forerun_mm))
             self._foreruns[tool] = forerun_mm

@@ -83,7 +83,7 @@ class ViewFollower:
         self._asked_for_in = (step, asked_for)
         node = scene.find("ProtocolPoints") if step == "ultrasound" else None
         index = node.GetControlPointIndexByLabel(asked_for) if node is not None and asked_for else -1
-        if index >= 0:
+        if node is not None and index >= 0:
             self._framing.face(node.GetNthControlPointPositionWorld(index))
 
     def _show_ct(self) -> None:
