@@ -20,6 +20,7 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.files import written_whole
 from CranioNavLib.rigid import Array, check_points
 
+PLANES = 12000  # one every 2 to 3 mm of a skull's outer table
 READERS = {".vtp": "vtkXMLPolyDataReader", ".ply": "vtkPLYReader", ".stl": "vtkSTLReader", ".vtk": "vtkPolyDataReader"}
 
 
@@ -54,42 +55,33 @@ class Surface:
         if self.triangles.ndim != 2 or self.triangles.shape[1] != 3 or len(self.triangles) == 0:
             raise InputError(f"expected surface triangles of shape (T >= 1, 3), got {self.triangles.shape}")
 
+    def _spanned(self, triangles: npt.NDArray[np.int64]) -> Array:
+        """(M, 3) outward normals of triangles (M, 3), twice as long as the triangles are large."""
+        corner = self.vertices_mm[triangles[:, 0]]
+        (x, y, z), (u, v, w) = ((self.vertices_mm[triangles[:, k]] - corner).T for k in (1, 2))
+        return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
+
     @cached_property
     def triangle_normals(self) -> Array:
         """(T, 3) unit outward normals."""
-        normals = self._double_areas()
-        lengths: Array = np.linalg.norm(normals, axis=1, keepdims=True)
-        unit: Array = normals / np.maximum(lengths, 1e-30)
-        return unit
+        return _unit(self._spanned(self.triangles))
 
     @cached_property
     def triangle_areas_mm2(self) -> Array:
         """(T,) areas."""
-        areas: Array = 0.5 * np.linalg.norm(self._double_areas(), axis=1)
+        areas: Array = 0.5 * np.linalg.norm(self._spanned(self.triangles), axis=1)
         return areas
 
     @cached_property
     def vertex_normals(self) -> Array:
         """(V, 3) unit outward normals, area-weighted over the triangles around each vertex."""
-        weighted = self._double_areas()
+        weighted = self._spanned(self.triangles)
         summed = np.zeros_like(self.vertices_mm)
         for axis in range(3):
-            along = np.ascontiguousarray(weighted[:, axis])
+            weights = np.ascontiguousarray(weighted[:, axis])
             for corner in range(3):
-                summed[:, axis] += np.bincount(self.triangles[:, corner], along, len(summed))
-        unit: Array = summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-30)
-        return unit
-
-    def _double_areas(self) -> Array:
-        """(T, 3) outward normals as long as twice the triangle's area; the cross product, but faster than numpy's."""
-        a = self.vertices_mm[self.triangles[:, 0]]
-        u, v = self.vertices_mm[self.triangles[:, 1]] - a, self.vertices_mm[self.triangles[:, 2]] - a
-        cross = np.empty_like(a)
-        for k in range(3):
-            i, j = (k + 1) % 3, (k + 2) % 3
-            np.multiply(u[:, i], v[:, j], out=cross[:, k])
-            cross[:, k] -= u[:, j] * v[:, i]
-        return cross
+                summed[:, axis] += np.bincount(self.triangles[:, corner], weights, len(summed))
+        return _unit(summed)
 
     @cached_property
     def center_mm(self) -> Array:
@@ -115,6 +107,19 @@ class Surface:
         )
         return scene
 
+    @cached_property
+    def planes(self) -> tuple[Any, Array, Array]:
+        """Search tree, middles (P, 3) and unit normals (P, 3) of planes through triangles taken evenly from the mesh.
+
+        Nearest planes are found several times faster than exact closest points, and lie off the triangles by some 0.1 mm.
+        """
+        from scipy.spatial import cKDTree
+
+        chosen = self.triangles[:: -(-len(self.triangles) // PLANES)]
+        normals = self.vertex_normals[chosen].sum(axis=1)
+        middles: Array = self.vertices_mm[chosen].mean(axis=1)
+        return cKDTree(middles), middles, _unit(normals)
+
     def prepare(self) -> None:
         """Make now what is otherwise made on first use and takes seconds for a skull: where that disturbs nobody."""
         self.vertex_normals  # noqa: B018
@@ -127,7 +132,7 @@ class Surface:
         nearest = found["points"].numpy().astype(float) + self.center_mm
         ids = found["primitive_ids"].numpy().astype(np.int64)
         distances: Array = np.linalg.norm(points - nearest, axis=1)
-        return ClosestPoints(nearest, distances, ids, self.triangle_normals[ids])
+        return ClosestPoints(nearest, distances, ids, _unit(self._spanned(self.triangles[ids])))
 
     def signed_distance(self, points_mm: npt.ArrayLike) -> Array:
         """(N,) distance, negative inside; only meaningful for a closed surface."""
@@ -227,3 +232,8 @@ class Surface:
             writer.SetCompressorTypeToLZ4()
             if not writer.Write():
                 raise InputError(f"cannot write {path}; is the disk full?")
+
+
+def _unit(vectors: Array) -> Array:
+    unit: Array = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
+    return unit

@@ -8,7 +8,7 @@ from typing import Annotated
 from CranioNavLib.parameters import Limits, Parameters
 
 from ModuleRegistrationLib.registration.closest_fit import check_problem
-from ModuleRegistrationLib.registration.global_search import Stage
+from ModuleRegistrationLib.registration.global_search import stages
 from ModuleRegistrationLib.registration.maximum_likelihood import solve
 from ModuleRegistrationLib.registration.problem import RegistrationProblem, RegistrationResult, SurfaceRegistration
 
@@ -23,16 +23,10 @@ class MaximumLikelihood(SurfaceRegistration):
     class Settings(Parameters):
         """How thoroughly to search; accuracy hardly depends on it once the minimum is found."""
 
-        starts: Annotated[int, Limits(1, 2000), "poses drawn from the landmarks' uncertainty"] = 72
-        samples: Annotated[int, Limits(50, 20000), "posterior samples that mean and covariance come from"] = 300
+        starts: Annotated[int, Limits(1, 2000), "poses drawn from the landmarks' uncertainty"] = 200
+        samples: Annotated[int, Limits(50, 20000), "posterior samples that the pose and its error come from"] = 400
 
     def register(self, problem: RegistrationProblem) -> RegistrationResult:
         """See the base class."""
         check_problem(problem)
-        starts = self.settings.starts
-        stages = (
-            Stage(starts, (25, 9, 4, 4)),
-            Stage(max(starts // 3, 1), (2, 2, 2)),
-            Stage(max(starts // 8, 1), (1, 1, 2, 4, 4)),
-        )
-        return solve(problem, stages, self.settings.samples)
+        return solve(problem, stages(self.settings.starts), self.settings.samples)

@@ -1,4 +1,4 @@
-"""Signed distance of points from the skull and the direction in which it changes, exact on the triangles."""
+"""Signed distance of points from the skull and the direction in which it changes: exact on the triangles, or by planes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from CranioNavLib.surface import Surface
 
 OFF_NORMAL_COSINE = 0.7  # a gap that leans more than 45 deg from the normal ends at an edge or a hole, not on the table
 SMALL_GAP_MM = 0.05  # the direction of a shorter gap is rounding
+PLANE_REACH_MM = 6.0  # sideways; a point farther from the middle of its plane hangs over a hole or beyond the surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +40,18 @@ def find_feet(surface: Surface, points_ras_mm: Array) -> Feet:
     distances = np.where(at_edge, side * length, along)
     tilted = side[:, None] * gap / np.maximum(length, SMALL_GAP_MM)[:, None]
     return Feet(distances, np.where(at_edge[:, None], tilted, normals), at_edge)
+
+
+def find_feet_on_planes(surface: Surface, points_ras_mm: Array) -> Feet:
+    """Feet of points (N, 3) on planes through triangles taken evenly from the surface: good enough to search with."""
+    tree, middles, normals = surface.planes
+    length, nearest = tree.query(points_ras_mm)
+    gap, direction = points_ras_mm - middles[nearest], normals[nearest]
+    along = np.einsum("ij,ij->i", gap, direction)
+    at_edge = length**2 - along**2 > PLANE_REACH_MM**2
+    side = np.where(along < 0, -1.0, 1.0)
+    tilted = side[:, None] * gap / np.maximum(length, SMALL_GAP_MM)[:, None]
+    return Feet(np.where(at_edge, side * length, along), np.where(at_edge[:, None], tilted, direction), at_edge)
 
 
 def smooth_normals(surface: Surface, on_surface_mm: Array, triangles: npt.NDArray[np.int64]) -> Array:

@@ -2,29 +2,44 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from CranioNavLib.rigid import Array, rigid_from_vector
 
+from ModuleRegistrationLib.registration.closest_field import find_feet_on_planes
 from ModuleRegistrationLib.registration.landmarks import motion_jacobian
 from ModuleRegistrationLib.registration.likelihood import Model, State, advance, evaluate, normal_equations
 
-FIRST_SCALE = 25.0  # the search begins with five times the stated SDs, so that a start 10 mm off feels the surface
+FIRST_SCALE = 25.0  # the first step goes with five times the stated SDs, so that a start 10 mm off feels the surface
+WHOLE = 4  # one pose in so many follows all points all the time
+MOST_COMPARED = 100  # poses that are told apart after a stage
+SHARE = 0.6  # of the points that a pose follows at first
 LONGEST_STEP_MM = 8.0
 SAME_PLACE_MM = 0.3  # RMS distance between the points of two poses that are one minimum
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Keep the best `keep` poses and move them once for each of `scales`, the largest factor on the variances allowed then."""
+    """Keep the best `keep` poses and move them once for each of `scales`, the largest factor on the variances allowed then.
+
+    With a `share` below 1 each pose follows points of its own choice: a choice without the outliers leads to the minimum
+    that all of them together would hide.
+    """
 
     keep: int
     scales: tuple[float, ...]
+    share: float = 1.0
 
 
-STAGES = (Stage(96, (25, 25, 16, 16)), Stage(32, (9, 9, 4, 4)), Stage(12, (1, 1, 1, 4, 4, 4)))
+def stages(starts: int) -> tuple[Stage, ...]:
+    """The search from so many starts."""
+    return (
+        Stage(starts, (9, 4, 1), SHARE),
+        Stage(max(starts // 4, 1), (1, 1, 1)),
+        Stage(max(starts // 10, 1), (1, 1, 2, 4)),
+    )
 
 
 def draw_starts(model: Model, count: int, rng: np.random.Generator) -> State:
@@ -41,15 +56,20 @@ def draw_starts(model: Model, count: int, rng: np.random.Generator) -> State:
     return State(motion, np.zeros(count), np.zeros(count), np.full(count, FIRST_SCALE), np.full(count, 0.1))
 
 
-def search(model: Model, rng: np.random.Generator, stages: tuple[Stage, ...] = STAGES) -> tuple[State, Array, int]:
+def search(model: Model, rng: np.random.Generator, stages: tuple[Stage, ...]) -> tuple[State, Array, int]:
     """The distinct minima found, best first, their scores (negative log evidence) and the number of steps."""
+    model = replace(model, feet=find_feet_on_planes)
     state = draw_starts(model, stages[0].keep, rng)
     cost: Array = np.zeros(stages[0].keep)
     steps = 0
     for stage in stages:
-        state = state.take(np.argsort(cost, kind="stable")[: stage.keep])
+        best = np.argsort(cost, kind="stable")[: MOST_COMPARED if steps else stage.keep]
+        state = state.take(distinct(model, state, best)[: stage.keep] if steps else best)
+        followed = rng.random((len(state.motion), len(model.points))) < stage.share
+        followed[: len(followed) // WHOLE] = True
         for largest in stage.scales:
             found = evaluate(model, state)
+            found = replace(found, weights=found.weights * followed, inlier=found.inlier * followed)
             state, _ = advance(model, state, found, LONGEST_STEP_MM, largest)
             cost, steps = found.cost, steps + 1  # of the pose before the step: good enough to drop the poor ones
     found = evaluate(model, state)

@@ -9,6 +9,7 @@ weight by themselves. Each unknown scale is solved for by expectation maximisati
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,13 +17,14 @@ import numpy.typing as npt
 from CranioNavLib.rigid import Array, rigid_from_vector, transform_points
 from CranioNavLib.surface import Surface
 
-from ModuleRegistrationLib.registration.closest_field import find_feet
+from ModuleRegistrationLib.registration.closest_field import Feet, find_feet
 from ModuleRegistrationLib.registration.landmarks import motion_jacobian
 from ModuleRegistrationLib.registration.problem import RegistrationProblem
 
 PARAMETERS = 8  # rotation, translation, offset, speed
-OUTLIER_WIDTH_MM = 3.0  # of the Cauchy law of outliers: another tissue interface lies 2-8 mm away
-OUTLIER_PRIOR = (2.0, 16.0)  # pseudo-counts of outliers and of points: one in eight before any data
+OUTLIER_WIDTH_MM, OUTLIER_FREEDOM = 5.0, 3.0  # of Student's law of outliers: another tissue interface lies 2-8 mm away
+OUTLIER_PEAK = 2 / (np.pi * np.sqrt(3) * OUTLIER_WIDTH_MM)  # its density at 0
+OUTLIER_PRIOR = (0.5, 6.0)  # pseudo-counts of outliers and of points
 SCALE_FREEDOM = 6.0  # what the stated variances are worth, in points: right to a factor of two or so
 LEAST_SCALE = 0.2  # of the variances: nothing measures much better than it says
 LANDMARK_SD_MM, LANDMARK_FREEDOM = 2.5, 1.0  # per axis; the prior is so broad that 1 mm and 8 mm are both likely
@@ -50,6 +52,7 @@ class Model:
     pivot: Array  # (3,)
     alternatives: Array  # (N, K) mm along the beam from the chosen echo; NaN pads
     alternative_log_odds: Array  # (N, K) against the chosen echo
+    feet: Callable[[Surface, Array], Feet] = find_feet
 
     def subset(self, index: npt.NDArray[np.int64]) -> Model:
         """The same model with some of the points."""
@@ -132,7 +135,7 @@ def evaluate(model: Model, state: State) -> Evaluation:
     turn = state.motion[:, None, :3, :3]
     beams = (turn @ model.beams[None, :, :, None])[..., 0]
     points = transform_points(state.motion, model.points) + beams * (model.depths * state.speed[:, None])[..., None]
-    feet = find_feet(model.surface, points.reshape(-1, 3))
+    feet = model.feet(model.surface, points.reshape(-1, 3))
     normals = feet.directions.reshape(count, number, 3)
     residuals = feet.distances_mm.reshape(count, number) - state.offset[:, None]
     back = (normals[..., None, :] @ turn)[..., 0, :]  # the normal as the measurement sees it
@@ -144,7 +147,9 @@ def evaluate(model: Model, state: State) -> Evaluation:
     design[..., 6] = -1.0
     design[..., 7] = slope * model.depths
     inlier, residuals, density = _inliers(model, state, residuals, variances, slope)
-    heavy = 2 / (OUTLIER_WIDTH_MM**2 + residuals**2)  # an outlier still pulls a little: its law's own slope
+    heavy = (OUTLIER_FREEDOM + 1) / (
+        OUTLIER_FREEDOM * OUTLIER_WIDTH_MM**2 + residuals**2
+    )  # an outlier still pulls a little: its law's own slope
     weights = inlier / (state.scale[:, None] * variances) + (1 - inlier) * heavy
     moved = transform_points(state.motion, model.landmarks)
     misses = moved - model.landmarks_ct
@@ -199,7 +204,7 @@ def _inliers(model: Model, state: State, residuals: Array, variances: Array, slo
     else:
         logarithm = -(residuals**2) / (2 * spread)
     good = prior * np.exp(np.maximum(logarithm, -600)) / np.sqrt(2 * np.pi * spread)
-    bad = (1 - prior) * OUTLIER_WIDTH_MM / np.pi / (OUTLIER_WIDTH_MM**2 + residuals**2)
+    bad = (1 - prior) * OUTLIER_PEAK / (1 + residuals**2 / (OUTLIER_FREEDOM * OUTLIER_WIDTH_MM**2)) ** 2
     density = good + bad
     return good / density, residuals, density
 

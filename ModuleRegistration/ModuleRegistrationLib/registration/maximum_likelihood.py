@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Optional
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +38,7 @@ class Solution:
     outliers: float
     steps: int
     stop_reason: str
+    degrees_of_freedom: Optional[float] = None
 
 
 def solve(problem: RegistrationProblem, stages: tuple[Stage, ...], samples: int) -> RegistrationResult:
@@ -94,7 +96,7 @@ def _solve_sparse(
         scale=float(minima.scale[order[0]]),
         outliers=float(minima.outliers[order[0]]),
         steps=steps,
-        stop_reason=f"mean of {samples} posterior samples around {len(order)} minima",
+        stop_reason=f"median of {samples} posterior samples around {len(order)} minima",
     )
 
 
@@ -112,7 +114,8 @@ def _solve_dense(model: Model, minima: State, scores: Array, problem: Registrati
         scale=float(refined.state.scale[0]),
         outliers=float(refined.state.outliers[0]),
         steps=steps + refined.steps,
-        stop_reason="points moved less than 0.001 mm" if refined.converged else "step limit of the refinement",
+        stop_reason="points moved less than 0.005 mm" if refined.converged else "step limit of the refinement",
+        degrees_of_freedom=refined.degrees_of_freedom,
     )
 
 
@@ -146,5 +149,6 @@ def _result(problem: RegistrationProblem, model: Model, solution: Solution) -> R
         speed_of_sound_m_s=speed * (1 + solution.speed),
         speed_of_sound_sd_m_s=speed * solution.speed_sd if model.speed_sd > 0 else problem.points.speed_of_sound_sd_m_s,
         surface_offset_mm=solution.offset_mm,
+        degrees_of_freedom=solution.degrees_of_freedom,
         minima=tuple(Minimum(m @ initial, float(p)) for m, p in zip(solution.motions, solution.probabilities)),
     )

@@ -1,4 +1,4 @@
-"""Mean and covariance of the pose over its posterior, by importance sampling around the minima of the search.
+"""Median and covariance of the pose over its posterior, by importance sampling around the minima of the search.
 
 With 18 points on a rough surface the likelihood is no paraboloid: its curvature at the best minimum promises too
 much, and neighbouring minima share the probability. Samples weighted by the posterior see both, and give each
@@ -14,11 +14,13 @@ from CranioNavLib.rigid import Array, invert_rigid, rigid_from_vector
 from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp
 
+from ModuleRegistrationLib.registration.landmarks import motion_jacobian
 from ModuleRegistrationLib.registration.likelihood import PARAMETERS, Model, State, evaluate
 
 PROPOSAL_FREEDOM = 5.0  # tails of the proposal: heavier than the posterior's
 PROPOSAL_STRETCH = 1.3  # its width beside the curvature's
 LOG_SCALE_SD = 0.35  # of the proposal for the common factor on the variances
+WEISZFELD_STEPS, CORE_MM = 12, 0.3
 LEAST_SHARE = 0.08  # of the samples that each minimum gets
 
 
@@ -26,7 +28,7 @@ LEAST_SHARE = 0.08  # of the samples that each minimum gets
 class Posterior:
     """Moments over the weighted samples, as a motion after the initial registration."""
 
-    motion: Array  # (4, 4) mean
+    motion: Array  # (4, 4) geometric median
     covariance: Array  # (6, 6) about the model's pivot, second moment about `motion`
     offset_mm: float
     speed: float
@@ -92,11 +94,10 @@ def _log_density(model: Model, minima: State, roots: Array, k: int, state: State
 
 def _moments(model: Model, minima: State, state: State, weight: Array, nearest: Array) -> Posterior:
     probabilities = np.bincount(nearest, weight, len(minima.motion))
-    best = int(np.argmax(probabilities))
-    inside = weight * (nearest == best)
-    apart = motion_vector(state.motion @ invert_rigid(minima.motion[best]), model.pivot)
-    mean = inside @ apart / inside.sum()
-    motion = rigid_from_vector(mean[:3], mean[3:], model.pivot) @ minima.motion[best]
+    origin = minima.motion[int(np.argmax(probabilities))]
+    vectors = motion_vector(state.motion @ invert_rigid(origin), model.pivot)
+    middle = geometric_median(vectors, weight, model.points - model.pivot)
+    motion = rigid_from_vector(middle[:3], middle[3:], model.pivot) @ origin
     left = motion_vector(state.motion @ invert_rigid(motion), model.pivot)
     speed = float(weight @ state.speed)
     return Posterior(
@@ -108,3 +109,19 @@ def _moments(model: Model, minima: State, state: State, weight: Array, nearest: 
         probabilities=np.asarray(probabilities, dtype=np.float64),
         effective_samples=float(1 / np.sum(weight**2)),
     )
+
+
+def geometric_median(vectors: Array, weight: Array, arms: Array) -> Array:
+    """(6,) the small motion whose mean distance from weighted motions (S, 6) is least.
+
+    A distance is the RMS shift of points at `arms` (N, 3). The
+    expected error is least there, also where the posterior has several peaks (Weiszfeld's iteration).
+    """
+    design = motion_jacobian(arms, np.zeros(3)).reshape(-1, 6)
+    metric = design.T @ design / len(arms)
+    middle = weight @ vectors
+    for _ in range(WEISZFELD_STEPS):
+        apart = vectors - middle
+        pull = weight / np.sqrt(np.einsum("si,ij,sj->s", apart, metric, apart) + CORE_MM**2)
+        middle = pull @ vectors / pull.sum()
+    return np.asarray(middle, dtype=np.float64)

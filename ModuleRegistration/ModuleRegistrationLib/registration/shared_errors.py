@@ -1,9 +1,10 @@
-"""Refinement with many points, and what points of one sweep or one spot of the skull have in common.
+"""Refinement with many points, whose errors are not independent: what a sweep or a spot of the skull has in common.
 
-Two thousand samples are not two thousand independent measurements. A sweep shares its coupling, its tilt and the
-drift of the tracker; neighbouring points share the segmentation's error. The pose is fitted as if they were
-independent, which costs little; its covariance is not: the variances of the shared errors are estimated from the
-residuals by their moments and carried through the fit (a sandwich with modelled clusters).
+A sweep shares its coupling, its tilt and the drift of the tracker; neighbouring points share the segmentation's error.
+Each sweep and each spot gets an error of its own, a Gaussian whose variance is estimated from the data (a mixed
+model, its variances by the fixed point of MacKay, Neural Computation 4:415, 1992). Pose and shared errors are solved
+for together, so that the shape of the skull within a sweep counts and its bias does not; the pose's covariance has the
+shared errors in it.
 """
 
 from __future__ import annotations
@@ -12,21 +13,29 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from CranioNavLib.rigid import Array
-from scipy.optimize import nnls
+from CranioNavLib.rigid import Array, rigid_from_vector
 
-from ModuleRegistrationLib.registration.likelihood import Evaluation, Model, State, advance, evaluate, normal_equations
+from ModuleRegistrationLib.registration.likelihood import (
+    PARAMETERS,
+    Evaluation,
+    Model,
+    State,
+    advance,
+    evaluate,
+    normal_equations,
+    update_scales,
+)
 
 Index = npt.NDArray[np.int64]
 
 # Sides of the cubes whose points share a segmentation error: the same slices; the same thickness and slant of the bone
 PATCHES_MM = (12.0, 40.0)
-INLIER = 0.5  # probability
 MOST_FLAT = 0.9
-LEAST_MEMBERS = 3.0  # on average; with fewer a shared error cannot be told from the points' own
-JUMP_MM, JUMP_RATIO = 10.0, 6.0  # a step between consecutive samples that ends a sweep
-EFFECT_SD_MM, EFFECT_FREEDOM = 0.12, 4.0  # what a shared error usually is, and how many groups that belief is worth
-MOST_STEPS, STEP_MM, ENOUGH_MM = 25, 2.0, 1e-3
+JUMP_MM, JUMP_RATIO, SMOOTHED = 12.0, 4.0, 5  # a step between the medians of so many samples that ends a sweep
+EFFECT_SD_MM, EFFECT_FREEDOM = 0.17, 3.0  # what a shared error usually is, and how many groups that belief is worth
+THINNED = 250  # points to converge with, before all of them
+MOST_STEPS, STEP_MM, ENOUGH_MM = 25, 2.0, 5e-3
+MIXED_STEPS, VARIANCE_STEPS = 8, 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +44,21 @@ class Refined:
 
     state: State  # one pose
     covariance: Array  # (8, 8) of rotation, translation, offset and speed
-    shared_sds_mm: tuple[float, ...]  # of sweeps and patches, where there were enough points to tell
+    shared_sds_mm: tuple[float, ...]  # of sweeps and of patches
     steps: int
     converged: bool
+    degrees_of_freedom: float  # behind the variance that sweeps share
+
+
+@dataclass(frozen=True, eq=False)
+class Mixed:
+    """Pose and shared errors solved for together, at a fixed linearisation."""
+
+    step: Array  # (8,)
+    covariance: Array  # (8, 8)
+    scale: float  # factor on the points' own variances
+    shared: Array  # (S,) mm^2, variance of each set's errors
+    gain: Array  # (8, N) what a point's error does to the pose
 
 
 def find_sweeps(positions_mm: Array, groups: Index) -> Index:
@@ -45,9 +66,14 @@ def find_sweeps(positions_mm: Array, groups: Index) -> Index:
     names, sweeps = np.unique(groups, return_inverse=True)
     if 1 < len(names) < len(positions_mm):
         return np.asarray(sweeps, dtype=np.int64)
-    steps = np.linalg.norm(np.diff(positions_mm, axis=0), axis=1)
-    jumps = steps > max(JUMP_MM, JUMP_RATIO * float(np.median(steps)))
-    return np.concatenate([[0], np.cumsum(jumps)]).astype(np.int64)
+    count, width = len(positions_mm), SMOOTHED
+    padded = np.pad(positions_mm, ((width - 1, width), (0, 0)), mode="edge")
+    smooth = np.median(np.lib.stride_tricks.sliding_window_view(padded, width, axis=0), axis=-1)  # outliers are no jumps
+    jumps = np.linalg.norm(smooth[width : width + count - 1] - smooth[: count - 1], axis=1)
+    steps: Array = np.linalg.norm(np.diff(positions_mm, axis=0), axis=1)
+    steps[jumps <= max(JUMP_MM, JUMP_RATIO * float(np.median(jumps)))] = 0
+    around: Array = np.lib.stride_tricks.sliding_window_view(np.pad(steps, width), 2 * width + 1).max(axis=1)
+    return np.concatenate([[0], np.cumsum((steps > 0) & (steps == around))]).astype(np.int64)
 
 
 def find_patches(points_mm: Array, side_mm: float) -> Index:
@@ -57,54 +83,82 @@ def find_patches(points_mm: Array, side_mm: float) -> Index:
 
 
 def refine(model: Model, state: State, groups: Index) -> Refined:
-    """Maximum of the posterior near the first pose of `state`, and its covariance with shared errors in it."""
-    state, steps, moved = state.take(np.array([0])), 0, np.inf
+    """Maximum of the posterior near the first pose of `state`, shared errors included, and its covariance."""
+    state, steps, moved = state.take(np.array([0])), 0, float("inf")
+    thin = model.subset(np.unique(np.linspace(0, len(model.points) - 1, THINNED).astype(np.int64)))
     while steps < MOST_STEPS and moved > ENOUGH_MM:
-        state, lengths = advance(model, state, evaluate(model, state), STEP_MM)
+        state, lengths = advance(thin, state, evaluate(thin, state), STEP_MM)
         steps, moved = steps + 1, float(lengths[0])
-    found = evaluate(model, state)
-    hessian, _ = normal_equations(model, state, found)
-    sets = [find_sweeps(model.points, groups), *(find_patches(model.points, side) for side in PATCHES_MM)]
-    sets = [members for members in sets if _worth_it(members)]
-    covariance, sds = shared_covariance(found, hessian[0], float(state.scale[0]), sets)
-    return Refined(state, covariance, sds, steps, moved <= ENOUGH_MM)
+    sweeps = [find_sweeps(model.points, groups)]
+    shared: Array = np.full(1, EFFECT_SD_MM**2)
+    for _ in range(MIXED_STEPS):
+        found = evaluate(model, state)
+        mixed = solve_mixed(model, state, found, sweeps, shared)
+        shared, step = mixed.shared, mixed.step
+        arm = model.points - model.pivot
+        moved = float(np.sqrt(((np.cross(step[:3], arm) + step[3:6]) ** 2).sum(axis=1).mean()))
+        state = State(
+            rigid_from_vector(step[:3], step[3:6], model.pivot)[None] @ state.motion,
+            state.offset + step[6],
+            state.speed + step[7],
+            np.array([mixed.scale]),
+            update_scales(model, found, normal_equations(model, state, found)[0])[1],
+        )
+        steps += 1
+        if moved < ENOUGH_MM:
+            break
+    covariance, sds = _with_patches(model, state, mixed, sweeps)
+    return Refined(state, covariance, sds, steps, moved < ENOUGH_MM, EFFECT_FREEDOM + int(sweeps[0].max()) + 1)
 
 
-def _worth_it(members: Index) -> bool:
-    return int(members.max()) > 0 and len(members) / (int(members.max()) + 1) >= LEAST_MEMBERS
+def _with_patches(model: Model, state: State, mixed: Mixed, sweeps: list[Index]) -> tuple[Array, tuple[float, ...]]:
+    """Covariance with the errors that points close to each other share, which the fit takes for independent.
 
-
-def shared_covariance(found: Evaluation, hessian: Array, scale: float, sets: list[Index]) -> tuple[Array, tuple[float, ...]]:
-    """(8, 8) covariance of the fit when points of a group share an error, and the SD of each set's shared error.
-
-    The fit takes `gain @ error` out of the errors, so the residuals are `(1 - design @ gain) error`. The mean square of
-    their group means is linear in the variances of the shared errors, which gives one equation a set.
+    Weighing the points by these errors, too, would give up more than it wins: their scale and shape are only guessed.
     """
-    design, weights, residuals = found.design[0], found.weights[0], found.residuals[0]
-    own = scale * found.variances[0]
+    patches = [find_patches(model.points, side) for side in PATCHES_MM]
+    shared = np.concatenate([mixed.shared, np.full(len(patches), EFFECT_SD_MM**2)])
+    for _ in range(2):
+        shared = solve_mixed(model, state, evaluate(model, state), sweeps + patches, shared).shared
+    covariance = mixed.covariance
+    for members, variance in zip(patches, shared[1:]):
+        reach = np.stack([np.bincount(members, row) for row in mixed.gain])
+        covariance = covariance + variance * reach @ reach.T
+    return covariance, tuple(float(sd) for sd in np.sqrt(shared))
+
+
+def solve_mixed(model: Model, state: State, found: Evaluation, sets: list[Index], shared: Array) -> Mixed:
+    """One Gauss-Newton step of pose, offset and speed beside the shared errors, and the variances that the data ask for."""
+    hessian, gradient = normal_equations(model, state, found)
     # an outlier law flattens the likelihood near its border: the curvature is less than the weights say
-    flat = weights * (1 - found.inlier[0]) * residuals**2 / own
-    inverse = np.linalg.inv(hessian - (design * np.minimum(flat, MOST_FLAT * weights)[:, None]).T @ design)
-    gain = inverse @ (design * weights[:, None]).T  # (8, N)
-    members = [np.eye(int(group.max()) + 1)[group] for group in sets]  # (N, G)
-    trust = (found.inlier[0] > INLIER).astype(float)
-    members = [m[:, trust @ m >= LEAST_MEMBERS] for m in members]  # a patch of outliers alone tells nothing
-    averages = [(m * trust[:, None]).T / (trust @ m)[:, None] for m in members]  # (G, N)
-    left = [m - design @ (gain @ m) for m in members]
-    table, right = np.zeros((len(sets), len(sets))), np.zeros(len(sets))
-    for i, average in enumerate(averages):
-        passed = average - (average @ design) @ gain
-        right[i] = ((average @ residuals) ** 2).sum() - ((passed**2) @ own).sum()
-        table[i] = [((average @ other) ** 2).sum() for other in left]
-    estimated = nnls(table, np.maximum(right, 0))[0] if sets else np.zeros(0)
-    covariance = inverse @ (hessian - (design * weights[:, None]).T @ design) @ inverse  # what the priors leave
-    covariance = covariance + (gain * own) @ gain.T
-    sds = []
-    for variance, m in zip(estimated, members):
-        count = m.shape[1]
-        # estimated from few groups, it may be larger: divided as the mean of an inverse chi-square is
-        shared = (count * variance + EFFECT_FREEDOM * EFFECT_SD_MM**2) / (count + EFFECT_FREEDOM - 3)
-        reach = gain @ m
-        covariance = covariance + shared * reach @ reach.T
-        sds.append(float(np.sqrt(shared)))
-    return covariance, tuple(sds)
+    weights, residuals, inlier = found.weights[0], found.residuals[0], found.inlier[0]
+    weights = weights * (1 - np.minimum((1 - inlier) * weights * residuals**2, MOST_FLAT))
+    sizes = [int(members.max()) + 1 for members in sets]
+    member = np.concatenate([[-1] * PARAMETERS, np.repeat(np.arange(len(sets)), sizes)])
+    design = np.concatenate([found.design[0], *(-np.eye(size)[members] for size, members in zip(sizes, sets))], axis=1)
+    priors = hessian[0] - found.design[0].T @ (found.design[0] * found.weights[0][:, None])
+    pull = gradient[0] - found.design[0].T @ (found.weights[0] * residuals)
+    information = design.T @ (design * weights[:, None])
+    slope = design.T @ (weights * residuals)
+    start = float(state.scale[0])
+    scale = start
+    for _ in range(VARIANCE_STEPS):
+        full = information * (start / scale)
+        full[:PARAMETERS, :PARAMETERS] += priors
+        full[range(PARAMETERS, len(full)), range(PARAMETERS, len(full))] += 1 / np.repeat(shared, sizes)
+        right = slope * (start / scale)
+        right[:PARAMETERS] += pull
+        covariance = np.asarray(np.linalg.inv(full), dtype=np.float64)
+        solution = -covariance @ right
+        spread = np.diagonal(covariance)
+        free = float(np.sum(covariance * information) * start / scale)  # parameters that the points have paid for
+        left = residuals + design @ solution
+        squares = float(np.sum(inlier * left**2 / found.variances[0]))
+        scale = squares / max(float(inlier.sum()) - free, 1.0)
+        for k in range(len(sets)):
+            mine = member == k
+            known = sizes[k] - float(spread[mine].sum()) / shared[k]
+            shared = shared.copy()
+            shared[k] = (float(np.sum(solution[mine] ** 2)) + EFFECT_FREEDOM * EFFECT_SD_MM**2) / (known + EFFECT_FREEDOM)
+    gain = covariance[:PARAMETERS] @ (design * weights[:, None]).T * (start / scale)
+    return Mixed(solution[:PARAMETERS], covariance[:PARAMETERS, :PARAMETERS], scale, shared, gain)

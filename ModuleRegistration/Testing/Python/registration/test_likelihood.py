@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from CranioNavLib.rigid import invert_rigid, rigid_from_vector
-from ModuleRegistrationLib.registration.global_search import draw_starts, search
+from ModuleRegistrationLib.registration.global_search import draw_starts, search, stages
 from ModuleRegistrationLib.registration.likelihood import State, evaluate, prepare
 from ModuleRegistrationLib.registration.posterior import motion_vector
 
@@ -45,7 +45,7 @@ def test_the_search_finds_the_true_minimum_from_poor_landmarks(a_case) -> None:
     found = 0
     for seed in range(8):
         case = a_case(seed, landmark_sd=6.9)
-        minima, _, _ = search(prepare(case.problem), np.random.default_rng(0))
+        minima, _, _ = search(prepare(case.problem), np.random.default_rng(0), stages(200))
         found += case.tre(minima.motion[0] @ case.problem.initial_reference_to_ras).mean() < 3
     assert found >= 7
 
