@@ -17,6 +17,7 @@ from trame.app import TrameApp
 from trame_slicer.app.logic import get_view_trame_id
 
 from Workstation.web.background import BackgroundRunner
+from Workstation.web.built_once import built_once
 from Workstation.web.drawings import drawings
 from Workstation.web.page import Page
 from Workstation.web.panel_view import PanelView
@@ -48,7 +49,7 @@ class WorkstationApp(TrameApp):
         self.server.enable_module(slicer_views)
         self.windows = Windows(self.server.state, self._draw_again)
         self.server.add_protocol_to_configure(lambda protocol: protocol.registerLinkProtocol(self.windows))
-        with host.quiet():
+        with host.quiet(), built_once():
             self._make_views()
         self.runner = BackgroundRunner()
         self.session = SessionFolder(folder or new_folder(), self._parameter_nodes)
@@ -71,7 +72,8 @@ class WorkstationApp(TrameApp):
             False,
         )
         self.files = FilesDialog(self.server, self.places, self._load_ct, self.runner.start)
-        self.page = Page(self.server, self.panels, self.layouts, PROCEDURE)
+        with built_once():
+            self.page = Page(self.server, self.panels, self.layouts, PROCEDURE)
         self.server.controller.on_server_ready.add_task(self._keep_fresh)
         self.server.controller.on_server_ready.add_task(self.painter.run)
 
