@@ -434,7 +434,7 @@ class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         """How many points are taken, and what the present one still lacks."""
         if self._palpated is None:
             return None
-        done = f"{self._palpated.taken} of {self._palpated.total} points, dwell {self._palpated.dwell:.0%}"
+        done = f"{self._palpated.taken} of {self._palpated.total} points; rested {self._palpated.dwell:.0%} of the time needed"
         return Reading("; ".join(filter(None, [done, self._palpated.reason])))
 
     def recorded(self):

@@ -82,7 +82,7 @@ PANEL = Panel(
                 Action("startRecording", "Record", "Begin to record lines and poses", primary=True),
                 Action("stopRecording", "Stop", "Finish the file and measure it"),
                 ReadOut("guidance", "Do now", large=True),
-                ReadOut("tilt", "Tilt off the bone's normal", "°", large=True),
+                ReadOut("tilt", "Tilt off the upright", "°", large=True),
                 ReadOut("dwell", "Taken"),
                 Action("undoPoint", "Undo", "Take back the last point", shortcut="Ctrl+Z"),
                 ReadOut("recorded", "Recorded"),

@@ -149,6 +149,11 @@ class ReadOut:
     unit: str = ""
     large: bool = False
 
+    @property
+    def spaced_unit(self) -> str:
+        """The unit as it follows a number: a degree sign stands close to it."""
+        return self.unit if self.unit in ("", "°") else f" {self.unit}"
+
 
 @dataclass(frozen=True)
 class Picture:

@@ -113,7 +113,7 @@ class PanelWidget:
             if isinstance(item, ReadOut):
                 reading = self.model.reading(item)
                 level = reading.level if reading else Level.PLAIN
-                text = f"{LEVEL_SIGNS[level]}{reading.text} {item.unit}".rstrip() if reading else "–"
+                text = f"{LEVEL_SIGNS[level]}{reading.text}{item.spaced_unit}" if reading else "–"
                 self.readings[item.name].setText(text)
                 self.readings[item.name].setStyleSheet(_style(level, item.large))
             elif isinstance(item, Picture):

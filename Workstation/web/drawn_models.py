@@ -36,7 +36,7 @@ class CoarseCopy:
         """Follow the role's model; True if it is another one than before."""
         model = scene.find(self._role)
         source = model.GetPolyData() if model is not None else None
-        if source is None or not source.GetNumberOfPoints():
+        if model is None or source is None or not source.GetNumberOfPoints():
             if self.node is not None:
                 host.scene().RemoveNode(self.node)  # another CT: its surface is not found yet
             self._source = None

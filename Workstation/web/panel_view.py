@@ -132,7 +132,7 @@ class PanelView:
 
     def _draw_reading(self, item: ReadOut) -> None:
         reading = f"{self.key}.readings['{item.name}']"
-        unit = f"(/^[-–]?[0-9]/.test({reading}.text) ? ' {item.unit}' : '')"  # words have no unit
+        unit = f"(/^[-–]?[0-9]/.test({reading}.text) ? '{item.spaced_unit}' : '')"  # words have no unit
         with html.Div(classes="py-1", v_show=f"{reading}.text !== '–'"):
             html.Div(item.label, classes="text-caption text-medium-emphasis")
             html.Div(
