@@ -20,7 +20,7 @@ from CranioNavLib.sequence_metafile import Acquisition, RecordingWriter
 
 from ModuleTrackingLib.pose_stream import PoseStream
 from ModuleTrackingLib.reference_base import REFERENCE, in_reference
-from ModuleTrackingLib.tracker import PoseStatus, ToolPose
+from ModuleTrackingLib.tracker import PoseStatus, ToolPose, tool_id
 
 PROBE = "Probe"
 LONGEST_WAIT_S = 0.08  # a line waits so long for the pose after it; a killed process loses no more than the lines waiting
@@ -76,7 +76,9 @@ class SessionRecorder:
         self._stream, self._clock, self._samples = stream, clock, samples
         self._start_s = clock()
         started = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
-        header = {"CranioNavTimeZero": f"start of recording, {started}", **(fields or {})}
+        ids = {f"{info.name}ToolId": tool_id(info.name, stream.tools) for info in stream.tools if info.name.isidentifier()}
+        ids = {name: text for name, text in ids.items() if (name + text).isascii() and text.isprintable()}
+        header = {"CranioNavTimeZero": f"start of recording, {started}", **ids, **(fields or {})}
         self._writer = RecordingWriter(path, samples, acquisition, header)
         self._lines: deque[_Line] = deque()
         self._last_s = 0.0

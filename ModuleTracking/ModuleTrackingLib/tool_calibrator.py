@@ -22,7 +22,7 @@ from ModuleTrackingLib.calibration import (
     save_calibration,
     tool_to_marker,
 )
-from ModuleTrackingLib.tracker import ToolInfo
+from ModuleTrackingLib.tracker import ToolInfo, tool_id
 
 
 class Kind(str, Enum):
@@ -155,10 +155,8 @@ class ToolCalibrator:
 
 
 def geometry_of(tool: str, tools: list[ToolInfo]) -> ToolGeometry:
-    """What tells this tool from another: part and serial number, and a fingerprint of its definition file."""
-    info = next((info for info in tools if info.name == tool), ToolInfo(tool))
-    known = (info.part_number, info.serial_number, info.definition)
-    return ToolGeometry.of(" ".join(text for text in known if text) or tool)
+    """What tells this tool from another."""
+    return ToolGeometry.of(tool_id(tool, tools))
 
 
 def _of(

@@ -52,6 +52,12 @@ class ToolInfo:
     definition: str = ""  # fingerprint of the file that says where its markers are, where the host has it
 
 
+def tool_id(tool: str, tools: list[ToolInfo]) -> str:
+    """What tells a tool from another of its name: part and serial number, and a fingerprint of its definition file."""
+    info = next((info for info in tools if info.name == tool), ToolInfo(tool))
+    return " ".join(text for text in (info.part_number, info.serial_number, info.definition) if text) or tool
+
+
 class Tracker(DevicePlugin):
     """Base of tracker plugins. `with tracker:` opens, starts and always closes.
 

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 import SimpleITK
 from CranioNavLib.rigid import rigid
-from CranioNavLib.sequence_metafile import pixels_beside, read_recording
+from CranioNavLib.sequence_metafile import Acquisition, RecordingWriter, pixels_beside, read_recording
+from ModuleTrackingLib.calibration import ToolGeometry, load_calibration
 from ModuleTrackingLib.pose_csv import PoseCsvWriter, read_pose_csv
 from ModuleTrackingLib.tracker import PoseStatus, ToolPose
 from scipy.spatial.transform import Rotation
@@ -191,6 +192,29 @@ def test_what_a_tracker_sees_is_served_to_a_foreign_client(a_table):
     np.testing.assert_allclose(pose.matrix, PROBE_TO_REFERENCE, atol=1e-3)
     assert line.image.shape[:2] == (1, 1)
     assert line.image.dtype == np.int16
+
+
+def test_recordings_of_a_water_bath_calibrate_the_probe(capsys, tmp_path):
+    """A bead seen from many sides: short echoes at the times that its distance from the face asks for."""
+    rng = np.random.default_rng(2)
+    truth, bead = rigid(Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), [3.0, -4, 50]), np.array([100.0, 20, 30])
+    speed, sampling_hz, at_s = 1482.36, 50e6, np.arange(5000) / 50e6  # of water at 20 deg C
+    with RecordingWriter(tmp_path / "bead.igs.mha", 5000, Acquisition(sampling_hz, 5e6), {"ProbeToolId": "P6 0815"}) as writer:
+        for k in range(80):
+            turn = Rotation.from_rotvec([*rng.uniform(-0.5, 0.5, 2), rng.uniform(-1, 1)]).as_matrix()
+            depth = rng.uniform(15, 60)
+            probe = rigid(turn, bead - turn @ [0, 0, depth])
+            delay = at_s - 2e-3 * depth / speed
+            line = 3000 * np.exp(-((delay / 2e-7) ** 2)) * np.cos(2 * np.pi * 5e6 * delay) + rng.normal(0, 10, 5000)
+            writer.append(k / 20, {"ProbeToReference": probe @ np.linalg.inv(truth)}, line=line.astype(np.int16))
+    target, bath = tmp_path / "p.json", tmp_path / "bead.igs.mha"
+    assert run(["tracker", "calibrate-probe", "--point", str(bath), "--face", "0,0,40", "-o", str(target), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["echoes_used"] == 80
+    found = load_calibration(target, "Probe", ToolGeometry.of("P6 0815"))
+    np.testing.assert_allclose(found.tool_to_marker[:3, 3], truth[:3, 3], atol=0.1)
+    np.testing.assert_allclose(found.tool_to_marker[:3, 2], truth[:3, 2], atol=0.003)
+    assert "expected three numbers" in refused(capsys, "tracker", "calibrate-probe", "--point", bath, "--beam", "0,1")
+    assert "no recording is given" in refused(capsys, "tracker", "calibrate-probe")
 
 
 @pytest.mark.parametrize(

@@ -134,6 +134,35 @@ def serve(
     serve_session(make_tracker(name, set_ or []), device, host, port, seconds, timeout)
 
 
+@app.command("calibrate-probe")
+def calibrate_probe(
+    point: Annotated[
+        Optional[list[Path]],
+        typer.Option(metavar="REC.igs.mha", help="a small target, e.g. a bead, seen from many sides"),
+    ] = None,
+    plane: Annotated[Optional[list[Path]], typer.Option(metavar="REC.igs.mha", help="a flat plate; may be repeated, too")] = None,
+    temperature: Annotated[float, typer.Option(metavar="DEG_C", help="of the water bath")] = 20.0,
+    beam: Annotated[str, typer.Option(metavar="X,Y,Z", help="rough direction of the beam in the marker's frame")] = "0,0,1",
+    face: Annotated[str, typer.Option(metavar="X,Y,Z", help="rough centre of the face in the marker's frame, mm")] = "0,0,0",
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.json", help="the calibration")] = Path(
+        "probe.calibration.json"
+    ),
+    json: Json = False,
+) -> None:
+    """Find the A-mode probe's face and beam from recordings of targets in a water bath, made by `tracker record --amode`."""
+    from Workstation.probe_calibration import calibrate_from
+    from Workstation.terminal import print_json
+
+    report = calibrate_from(point or [], plane or [], temperature, beam, face, output)
+    if json:
+        print_json(report)
+        return
+    print(
+        f"{output}: face known to {report['face_sd_mm']:.2f} mm, beam to {report['beam_sd_deg']:.2f} deg (SD, worst direction), "
+        f"from {report['echoes_used']} echoes, {report['echoes_left_out']} left out"
+    )
+
+
 @app.command("recover")
 def recover_recording(
     recording: Annotated[Path, typer.Argument(metavar="FILE.igs.mha", help="the recording that was interrupted")],
