@@ -236,6 +236,11 @@ class Progress:
         if self._listener is not None:
             self._listener(text, self.share)
 
+    @property
+    def cancelled(self) -> bool:
+        """Whether the user asked to stop."""
+        return self._cancelled.is_set()
+
     def cancel(self) -> None:
         """Ask the work to stop at its next report."""
         self._cancelled.set()

@@ -156,8 +156,11 @@ class PanelModel:
         return self._guarded(lambda: self._perform(action))
 
     def cancel(self) -> None:
-        """Ask the long work under way to stop."""
+        """Stop the long work under way; the user goes on at once, and what the work may still bring is dropped."""
         self.progress.cancel()
+        if self.busy is not None:
+            label, self.busy = self.busy.label, None
+            self._say(f"{label}: cancelled", Level.WARNING)
 
     # Read-outs and steps
 
@@ -244,11 +247,13 @@ class PanelModel:
             self._say(result.run(progress) or "", Level.GOOD)
             return
         self.busy = action
-        self.runner.start(lambda: result.compute(progress), lambda outcome: self._finish(result, outcome))
+        self.runner.start(lambda: result.compute(progress), lambda outcome: self._finish(result, outcome, progress))
         self.notify()
 
-    def _finish(self, task: Task, outcome: Any) -> None:
+    def _finish(self, task: Task, outcome: Any, progress: Progress) -> None:
         """In the scene's thread: what a runner brought back becomes nodes, or a message."""
+        if progress.cancelled:
+            return
         self.busy = None
 
         def bring_in() -> None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
+import time
 from typing import Any
 
 import numpy as np
 import pytest
 from CranioNavLib import host, scene_data
+from CranioNavLib.errors import InputError
 from CranioNavLib.files import set_aside
 from CranioNavLib.panel_model import PanelModel
 from CranioNavLib.slicer_files import LabelledPoints
@@ -147,3 +150,18 @@ def test_what_was_verified_is_kept(tmp_path):
     state = json.loads((tmp_path / "session.json").read_text())
     assert state["tables"]["TargetErrors"] == {"target": ["a"], "TRE (mm)": [1.5]}
     assert state["registered_points"] == {"labels": ["p"], "positions_mm": [[1.0, 2.0, 3.0]]}
+
+
+def test_a_report_that_is_cancelled_is_written_no_further(tmp_path):
+    from CranioNavLib.panel import Cancelled, Progress
+
+    from Workstation.web.session_panel import _run_until_cancelled
+
+    late = "import time, pathlib; time.sleep(1.5); pathlib.Path('late').touch()"
+    progress = Progress(lambda text, share: progress.cancel())
+    with pytest.raises(Cancelled):
+        _run_until_cancelled([sys.executable, "-c", late], tmp_path, progress)
+    time.sleep(2)
+    assert not (tmp_path / "late").exists()
+    with pytest.raises(InputError, match="no such case"):
+        _run_until_cancelled([sys.executable, "-c", "raise SystemExit('no such case')"], tmp_path, Progress())

@@ -7,12 +7,15 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+WORKERS = 3
+
 
 class BackgroundRunner:
     """Runs `compute` in a worker thread and `finished(result or exception)` in the server's event loop."""
 
     def __init__(self) -> None:
-        self._workers = ThreadPoolExecutor(max_workers=1, thread_name_prefix="cranionav-work")
+        # the CT is saved while the user works on, and what he cancels may run for a while yet
+        self._workers = ThreadPoolExecutor(max_workers=WORKERS, thread_name_prefix="cranionav-work")
         self._tasks: set[asyncio.Task[None]] = set()
 
     def start(self, compute: Callable[[], Any], finished: Callable[[Any], None]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from CranioNavLib.scripted_module import ScriptedLoadableModuleLogic
 from Workstation.web.session_folder import SessionFolder, last_session
 
 OFFERED = ("report.html", "scene.mrb", "ReferenceToRas.tfm", "registration.json")  # what the page lets one open
+USUAL_REPORT_S = 15.0  # the bar stands at half then
 SAME_MM = 0.05  # between the registration on the screen and the one that the report repeats from the files
 
 
@@ -149,9 +151,7 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
             command = [sys.executable, "-m", "Workstation", "register", str(folder), "-o", str(folder), "--mode", "III"]
             command += ["--method", wanted.method, "--segmentation", wanted.segmentation]
             root = Path(__file__).resolve().parents[2]
-            done = subprocess.run(command, capture_output=True, text=True, cwd=root, check=False)
-            if done.returncode != 0:
-                raise InputError((done.stderr.strip().splitlines() or ["the report could not be written"])[-1])
+            _run_until_cancelled(command, root, progress)
             record = json.loads((folder / "registration.json").read_text(encoding="utf-8"))
             corners = np.array([[0, 0, 0, 1], [80, 0, 0, 1], [0, 80, 0, 1], [0, 0, 80, 1]], dtype=float)
             return float(np.abs((np.array(record["reference_to_ras"]) - shown) @ corners.T).max())
@@ -188,6 +188,24 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         if self._report_of != json.dumps(scene_data.get_transform("ReferenceToRas").tolist()):
             return StepStatus(StepState.ATTENTION, "the registration has changed; write the report again")
         return StepStatus(StepState.DONE)
+
+
+def _run_until_cancelled(command: list[str], folder: Path, progress: Progress) -> None:
+    """Run a command of this program to its end; killed when the user cancels."""
+    begun = time.monotonic()
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=folder) as process:
+        try:
+            while True:
+                try:
+                    _, said = process.communicate(timeout=0.3)
+                    break
+                except subprocess.TimeoutExpired:
+                    share = 1.0 - 0.5 ** ((time.monotonic() - begun) / USUAL_REPORT_S)
+                    progress("registering the saved session and drawing the report", share)
+        finally:
+            process.kill()
+    if process.returncode != 0:
+        raise InputError((said.strip().splitlines() or ["the report could not be written"])[-1])
 
 
 def _simulated_session(seed: int) -> Any:

@@ -16,11 +16,14 @@ from CranioNavLib.module_logic import ParametersInScene
 from CranioNavLib.panel import (
     Action,
     Cancelled,
+    Entry,
     FileField,
     Level,
+    ListField,
     NodeField,
     Panel,
     ParameterField,
+    Picture,
     PluginField,
     Progress,
     Reading,
@@ -290,13 +293,20 @@ def test_long_work_runs_in_the_runner_and_blocks_other_actions_meanwhile(a_model
     assert a_model.progress.share == 0.5
 
 
-def test_cancelled_work_changes_nothing(a_model):
+def test_cancelled_work_frees_the_user_at_once_and_changes_nothing(a_model):
     a_model.runner = runner = LaterRunner()
     a_model.run(item("cook"))
     a_model.cancel()
-    runner.go()
-    assert a_model.message.text == "cancelled while cooking"
     assert a_model.busy is None
+    assert a_model.blocked(item("squeeze")) == ""
+    a_model.runner = after = LaterRunner()
+    a_model.run(item("cook"))
+    runner.go()
+    assert a_model.busy is item("cook")  # the one begun since
+    after.go()
+    assert a_model.message.text == "42 glasses by worker"
+    a_model.cancel()
+    assert a_model.message.text == "42 glasses by worker"
 
 
 def test_a_defect_in_long_work_is_shown_as_one(a_model, caplog):
@@ -329,3 +339,49 @@ def test_progress_is_kept_within_bounds_and_stops_when_cancelled():
     progress.cancel()
     with pytest.raises(Cancelled, match="cancelled while c"):
         progress("c", 0.5)
+
+
+SHELF = Panel(
+    "Shelf",
+    "Shelf",
+    KitchenParameters,
+    (Step("first", "Jars", "", (ListField("path", "Jar", "jars"), Picture("label", "Its label"))),),
+)
+
+
+class ShelfLogic(KitchenLogic):
+    def jars(self):
+        return (Entry("plum", True), Entry("quince", note="empty"))
+
+    def pathChosen(self):
+        if self.parameters().read().path == "quince":
+            raise InputError("the jar of quince is empty; fill it first")
+        return "plum is opened"
+
+    def label(self):
+        if self.parameters().read().path != "plum":
+            raise InputError("no jar is open")
+        return "<svg/>"
+
+
+def test_choosing_in_a_list_is_kept_and_the_logic_hears_of_it():
+    model = PanelModel(SHELF, ShelfLogic())
+    jar, picture = SHELF.steps[0].items
+    assert [one.name for one in model.entries(jar)] == ["plum", "quince"]
+    assert model.pick(jar, "plum")
+    assert model.value(jar) == "plum"
+    assert model.message.text == "plum is opened"
+    assert model.drawing(picture) == "<svg/>"
+    assert not model.pick(jar, "quince")
+    assert "fill it first" in model.message.text
+    assert model.message.level is Level.BAD
+    assert model.drawing(picture) is None
+
+
+def test_a_list_without_its_method_is_refused():
+    with pytest.raises(InputError, match="jars"):
+        check_panel(SHELF, KitchenLogic)
+
+
+def test_a_degree_sign_stands_close_to_its_number():
+    assert [ReadOut("tilt", "Tilt", unit).spaced_unit for unit in ("°", "mm", "")] == ["°", " mm", ""]
