@@ -16,7 +16,9 @@ import numpy.typing as npt
 from CranioNavLib.rigid import Array, rigid_from_vector
 
 from ModuleRegistrationLib.registration.likelihood import (
+    LEAST_SCALE,
     PARAMETERS,
+    SCALE_FREEDOM,
     Evaluation,
     Model,
     State,
@@ -154,7 +156,7 @@ def solve_mixed(model: Model, state: State, found: Evaluation, sets: list[Index]
         free = float(np.sum(covariance * information) * start / scale)  # parameters that the points have paid for
         left = residuals + design @ solution
         squares = float(np.sum(inlier * left**2 / found.variances[0]))
-        scale = squares / max(float(inlier.sum()) - free, 1.0)
+        scale = max((squares + SCALE_FREEDOM) / (max(float(inlier.sum()) - free, 0.0) + SCALE_FREEDOM), LEAST_SCALE)
         for k in range(len(sets)):
             mine = member == k
             known = sizes[k] - float(spread[mine].sum()) / shared[k]

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 from ModuleRegistrationLib.registration.error_theory import predict_tre_of
 from ModuleRegistrationLib.registration.likelihood import State, prepare
@@ -62,3 +64,12 @@ def test_predicted_error_covers_the_true_one_with_shared_biases(a_case) -> None:
         result = METHOD.register(case.problem)
         inside.append(np.mean(case.tre(result.reference_to_ras) < predict_tre_of(result, case.targets).p95_mm))
     assert np.mean(inside) > 0.8
+
+
+def test_points_that_do_not_fit_at_all_still_give_a_finite_error(a_case) -> None:
+    case = a_case(6, repeats=4, noise_sd=0.2)
+    points = case.problem.points
+    middle = points.positions_mm.mean(axis=0)
+    larger = replace(points, positions_mm=middle + 1.07 * (points.positions_mm - middle))
+    result = METHOD.register(replace(case.problem, points=larger))
+    assert np.isfinite(result.covariance).all()
