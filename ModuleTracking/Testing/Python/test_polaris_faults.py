@@ -93,6 +93,17 @@ def test_tracking_goes_on_while_half_of_the_replies_are_damaged(replies):
     assert good > 150
 
 
+def test_a_wait_too_short_for_the_clock_to_tell_ends_all_the_same():
+    rig = Rig()
+    with rig.tracker:
+        rig.clock.time_s = 2.0**20 + 0.3  # steps of 1e-10 s
+        port = rig.tracker._conductor.port
+        for timeout_s in (1e-12, 1e-9):
+            before = rig.clock.now()
+            assert port.read(timeout_s) == b""
+            assert rig.clock.now() > before
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("replies", ["BX", "TX"])
 def test_ten_thousand_corruptions_while_tracking(replies):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from ModuleTrackingLib.ndi.emulator.station import Station
@@ -9,7 +10,7 @@ from ModuleTrackingLib.ndi.steps import PortLostError
 
 
 class JumpingClock:
-    """Time that passes only when somebody waits."""
+    """Time that passes only when somebody waits; however short the wait, it does pass."""
 
     def __init__(self) -> None:
         self.time_s = 1000.0
@@ -20,7 +21,11 @@ class JumpingClock:
 
     def sleep(self, seconds: float) -> None:
         """See Clock.sleep."""
-        self.time_s += max(0.0, seconds)
+        self.time_s = self.after(seconds)
+
+    def after(self, seconds: float) -> float:
+        """The time in so many seconds: later than now even where the sum rounds to now."""
+        return max(self.time_s + seconds, math.nextafter(self.time_s, math.inf)) if seconds > 0 else self.time_s
 
 
 class LoopbackPort:
@@ -50,7 +55,7 @@ class LoopbackPort:
 
     def read(self, timeout_s: float) -> bytes:
         """See Port.read."""
-        until_s = self.clock.now() + timeout_s
+        until_s = self.clock.after(timeout_s)
         while True:
             self._check()
             self.pending += self.station.take_due(self.clock.now(), self.speed)
