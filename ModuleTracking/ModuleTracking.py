@@ -264,11 +264,13 @@ class ModuleTrackingLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
     def digitise(self):
         """Add the resting tip of the chosen tool to the chosen list. Returns a message."""
+        wanted = self.parameters().read()
+        tips = self._restingTips(wanted.tool.value)  # before the first imports: they may outlast the tips
+
         from CranioNavLib.slicer_files import LabelledPoints, add_points
         from ModuleTrackingLib.digitise import rest_of_tip
 
-        wanted = self.parameters().read()
-        rest = rest_of_tip(self._restingTips(wanted.tool.value))
+        rest = rest_of_tip(tips)
         label = self._nextLabel(wanted.points)
         node = scene.find_or_create(wanted.points.value)
         self._refuseTwice(node, rest.position_mm, label)
