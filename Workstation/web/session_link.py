@@ -16,6 +16,8 @@ STYLE = """
 .link-lost { position: fixed; inset: 0; z-index: 9999; display: flex; flex-direction: column; align-items: center;
   justify-content: center; gap: 16px; background: rgba(10, 14, 18, 0.9); color: #fff; text-align: center; padding: 32px; }
 .link-lost b { font-size: 40px; } .link-lost span { font-size: 22px; max-width: 30em; }
+.link-watching { position: fixed; bottom: 0; right: 0; left: 580px; z-index: 900; display: flex; align-items: center;
+  justify-content: center; gap: 16px; padding: 8px; background: #3a2f12; color: #f0b429; border-top: 2px solid #f0b429; }
 [inert] .v-btn, [inert] .v-field, [inert] .v-list-item { opacity: 0.6; }
 .image-display-area { height: 100%; object-fit: contain; }
 """
@@ -83,9 +85,9 @@ SCRIPT = f"""
 
 
 def draw_link() -> None:
-    """In the title bar: who controls, where this window does not, with a button; and the script that keeps the link."""
+    """A line below the views that says who controls, where this window does not, with a button; and the script of the link."""
     client.Style(STYLE)
-    with html.Div(v_if=(WATCHING,), classes="d-flex align-center mr-4", style="gap: 12px", raw_attrs=["data-control"]):
-        html.Div("! {{ control.text }}; this window watches", classes="text-body-1", style="color: #f0b429")
+    with html.Div(v_if=(WATCHING,), classes="link-watching", raw_attrs=["data-control"]):
+        html.Div("! {{ control.text }}; this window watches", classes="text-body-1")
         v3.VBtn("Take control", variant="flat", color="primary", size="small", raw_attrs=["data-take-control"])
     client.Script(SCRIPT)
