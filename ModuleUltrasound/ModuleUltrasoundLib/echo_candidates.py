@@ -14,10 +14,14 @@ CANDIDATES = 8  # echoes kept of a line
 NOISE_BLOCKS = 10
 LOG_RAYLEIGH = 0.058  # mean of the logarithm of Rayleigh noise with unit quadratures: (ln 2 - Euler's constant) / 2
 GUARD_CYCLES = 2.5  # half length of a pulse: levels before and after an echo are taken outside of it
+FOOT_CYCLES = (1.0, 2.5)  # from an echo's peak to its feet
 NEAR_S = 3e-6  # length of the stretches before and after an echo: 2.3 mm
 SALIENCE_S = 2.5e-6  # an echo stands out over this much on both sides
 DECIBEL = 20 / np.log(10)
 TYPICAL_ATTENUATION = 1.0  # dB/cm/MHz; only ranks candidates, soft tissue has 0.3 to 2.6
+# How candidates are ranked, chosen so that the bone of both families of simulated lines is among the first
+LEVEL_WEIGHT, RISE_WEIGHT, BEFORE_WEIGHT, BEHIND_WEIGHT = (np.float32(x) for x in (1.6, 0.3, 0.2, 0.8))
+SALIENCE_GUARD_CYCLES = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +38,9 @@ class Candidates:
     after_db: Array  # (n, K) just behind
     before_all_db: Array  # (n, K) from the skin to the echo
     after_all_db: Array  # (n, K) from the echo to the end of the line
+    rise_db: Array  # (n, K) the echo over the level at its own front foot
+    fall_db: Array  # (n, K) the echo over the level at its own rear foot: a lasting pulse or a lump of echoes falls slowly
+    end_db: Array  # (n, K) level of the line's end over its quietest stretch: a receiver may amplify with depth
     noise: Array  # (n,) standard deviation of one quadrature
 
     @property
@@ -55,7 +62,12 @@ class Levels:
         first, last = np.clip(first, 0, length), np.clip(last, 0, length)
         rows = np.arange(len(self.sums))[:, None]
         total = self.sums[rows, last] - self.sums[rows, first]
-        return np.asarray(np.where(last > first, total / np.maximum(last - first, 1), np.nan), dtype=float)
+        return np.asarray(np.where(last > first, total / np.maximum(last - first, 1), np.nan), dtype=np.float32)
+
+    def means(self, *stretches: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]) -> list[Array]:
+        """As mean, for several stretches at once."""
+        first, last = (np.concatenate([stretch[k] for stretch in stretches], axis=1) for k in (0, 1))
+        return np.split(self.mean(first, last), len(stretches), axis=1)
 
 
 def take_levels(magnitude: Floats) -> Levels:
@@ -76,9 +88,11 @@ def noise_level(levels: Levels) -> Array:
 
 def rough_noise(magnitude: Floats) -> Array:
     """As noise_level, but from the envelope itself: a little too high, and cheap."""
-    count, length = magnitude.shape
+    length = magnitude.shape[1]
     block = max(length // NOISE_BLOCKS, 1)
-    means = magnitude[:, : block * (length // block)].reshape(count, length // block, block).mean(axis=2)
+    blocks = length // block
+    parts = [magnitude[:, k * block : (k + 1) * block] @ np.full(block, 1 / block, dtype=np.float32) for k in range(blocks)]
+    means = np.stack(parts, axis=1)
     return np.asarray(means.min(axis=1).astype(float) / np.sqrt(np.pi / 2)) + 1e-6
 
 
@@ -100,21 +114,27 @@ def fit_tops(magnitude: Floats, samples: npt.NDArray[np.int64]) -> tuple[Array, 
     return np.where(bad, np.nan, safe + offset), np.where(bad, np.nan, height), np.where(bad, np.nan, np.sqrt(-1 / curvature))
 
 
-def salient_peaks(levels: Levels, rate_hz: float, rise_db_per_s: float, first: int, last: int) -> npt.NDArray[np.int64]:
+def salient_peaks(
+    levels: Levels, rate_hz: float, rise_db_per_s: float, first: int, last: int, guard_s: float
+) -> npt.NDArray[np.int64]:
     """Indices (n, K) of the local maxima in [first, last) that stand out most from what surrounds them; -1 pads.
 
-    Standing out is judged against the level around, so that a bone echo far below an interface near the skin is kept;
-    the level itself, raised by the tissue's attenuation, counts a little too.
+    Standing out is judged mainly against the level behind, where bone casts its shadow, so that a bone echo far below an
+    interface before it is kept; the level itself, raised by the tissue's attenuation, counts too.
     """
-    reach = max(int(SALIENCE_S * rate_hz), 2)
-    index = np.arange(first + 1, last - 1)
-    low, high = np.clip(index - reach, 0, None), np.clip(index + reach + 1, None, levels.log.shape[1])
-    around = (levels.sums[:, high] - levels.sums[:, low]) / (high - low).astype(np.float32)
+    guard = max(int(guard_s * rate_hz), 1)
+    length = min(max(int(SALIENCE_S * rate_hz) - guard, 2), levels.log.shape[1])
+    start = max(first - guard - length, 0)  # sums before it and behind `stop` are not asked for
+    stop = min(last + guard + length, levels.log.shape[1])
+    running = levels.sums[:, start + length : stop + 1] - levels.sums[:, start : stop + 1 - length]
+    running *= np.float32(1 / length)
+    rise = (np.arange(1, last - first - 1) * (RISE_WEIGHT * rise_db_per_s / rate_hz / DECIBEL)).astype(np.float32)
     here = levels.log[:, first + 1 : last - 1]
-    rise = ((index - first) * (rise_db_per_s / rate_hz / DECIBEL)).astype(np.float32)
-    score = 1.3 * here + 0.3 * rise - around
-    peak = (here > levels.log[:, first : last - 2]) & (here >= levels.log[:, first + 2 : last])
-    score = np.where(peak, score, np.float32(-np.inf))
+    score = LEVEL_WEIGHT * here + rise
+    score -= BEFORE_WEIGHT * _stretch(running, first + 1 - guard - length - start, last - 1 - guard - length - start)
+    score -= BEHIND_WEIGHT * _stretch(running, first + 1 + guard - start, last - 1 + guard - start)
+    lower = (here <= levels.log[:, first : last - 2]) | (here < levels.log[:, first + 2 : last])
+    np.copyto(score, np.float32(-np.inf), where=lower)
     samples = np.full((len(score), CANDIDATES), -1, dtype=np.int64)
     rows = np.arange(len(score))
     for rank in range(CANDIDATES):  # a few passes of argmax cost less than sorting every line
@@ -122,6 +142,14 @@ def salient_peaks(levels: Levels, rate_hz: float, rise_db_per_s: float, first: i
         samples[:, rank] = np.where(np.isfinite(score[rows, best]), best + first + 1, -1)
         score[rows, best] = -np.inf
     return samples
+
+
+def _stretch(values: Floats, start: int, stop: int) -> Floats:
+    """Columns [start, stop) of values (n, M); beyond the ends the first and last column repeat."""
+    inside = values[:, max(start, 0) : max(stop, 0)]
+    if start >= 0 and stop <= values.shape[1]:
+        return inside
+    return np.asarray(values[:, np.clip(np.arange(start, stop), 0, values.shape[1] - 1)])
 
 
 def find_candidates(
@@ -144,7 +172,7 @@ def find_candidates(
     if last - first < 6:
         return _none(len(magnitude), noise)
     rise = TYPICAL_ATTENUATION * transducer_hz * 1e-6 * 154e3  # dB a second of delay: 77 km/s of depth, both ways, per cm
-    samples = salient_peaks(levels, rate, rise, first, last)
+    samples = salient_peaks(levels, rate, rise, first, last, SALIENCE_GUARD_CYCLES / transducer_hz)
     positions, heights, widths = fit_tops(magnitude, samples)
     rows = np.arange(len(samples))[:, None]
     complex_values = envelopes.values[rows, np.clip(samples, 0, None)]
@@ -153,29 +181,42 @@ def find_candidates(
     ahead, back = (envelopes.values[rows, np.clip(samples + k, 0, magnitude.shape[1] - 1)] for k in (1, -1))
     turn = np.angle(ahead * back.conj())
     guard, near, reach = (int(x * rate) for x in (GUARD_CYCLES / transducer_hz, NEAR_S, SALIENCE_S))
+    inner, outer = (max(round(x * rate / transducer_hz), 1) for x in FOOT_CYCLES)
     skin_sample = np.full_like(samples, int(skin * rate) + guard)
     end = np.full_like(samples, magnitude.shape[1])
-    base = np.log(noise)[:, None] + LOG_RAYLEIGH
-    around = levels.mean(samples - reach, samples + reach + 1)
-    start_near = np.maximum(samples - guard - near, skin_sample)
+    around, before, after, before_all, after_all, front, rear, last_level = levels.means(
+        (samples - reach, samples + reach + 1),
+        (np.maximum(samples - guard - near, skin_sample), samples - guard),
+        (samples + guard, samples + guard + near),
+        (skin_sample, samples - guard),
+        (samples + guard, end),
+        (samples - outer, samples - inner),
+        (samples + inner + 1, samples + outer + 1),
+        (end - guard * 4, end),
+    )
+    base, height = np.log(noise)[:, None] + LOG_RAYLEIGH, np.log(heights)
     return Candidates(
         delays_s=positions / rate - skin_s[:, None],
         amplitudes=heights,
         phases=phases,
         widths_s=widths / rate,
         frequencies_hz=np.where(samples < 0, np.nan, envelopes.carrier_hz + turn * rate / (4 * np.pi)),
-        saliences_db=DECIBEL * (np.log(heights) - around),
-        before_db=DECIBEL * (levels.mean(start_near, samples - guard) - base),
-        after_db=DECIBEL * (levels.mean(samples + guard, samples + guard + near) - base),
-        before_all_db=DECIBEL * (levels.mean(skin_sample, samples - guard) - base),
-        after_all_db=DECIBEL * (levels.mean(samples + guard, end) - base),
+        saliences_db=DECIBEL * (height - around),
+        before_db=DECIBEL * (before - base),
+        after_db=DECIBEL * (after - base),
+        before_all_db=DECIBEL * (before_all - base),
+        after_all_db=DECIBEL * (after_all - base),
+        rise_db=DECIBEL * (height - front),
+        fall_db=DECIBEL * (height - rear),
+        end_db=DECIBEL * (last_level - base),
         noise=noise,
     )
 
 
 def _none(count: int, noise: Array) -> Candidates:
     empty = np.full((count, CANDIDATES), np.nan)
-    return Candidates(empty, empty, empty, empty, empty, empty, empty, empty, empty, empty, noise)
+    names = [name for name in Candidates.__dataclass_fields__ if name != "noise"]
+    return Candidates(**dict.fromkeys(names, empty), noise=noise)
 
 
 def concatenate(parts: list[Candidates]) -> Candidates:

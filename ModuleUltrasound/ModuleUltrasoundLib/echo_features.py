@@ -25,7 +25,7 @@ NAMES = (
     "snr", "salience", "before", "after", "before all", "after all", "drop", "drop all", "stronger before", "its distance",
     "stronger behind", "its distance behind", "depth", "loss", "multiple", "multiple share", "forerun", "has forerun",
     "reverberation", "width", "rank before", "rank behind", "line snr", "next best",
-    "frequency", "frequency against before", "frequency against behind",
+    "frequency", "frequency against before", "frequency against behind", "rise", "fall", "end of line", "own reverberation",
 )  # fmt: skip
 
 
@@ -50,23 +50,24 @@ def line_features(
         for where, which in ((before, which_before), (behind, which_behind))
     ]
     multiple, share = _multiples(candidates, forerun, nominal_skin_s, transducer_hz, valid)
-    reverberation = _reverberations(candidates, pair, before)
+    reverberation, own = _reverberations(candidates, pair, before)
     seen = forerun.amplitude[:, None] > 0
     over_forerun = np.where(
         seen, DECIBEL * np.log(np.maximum(candidates.amplitudes, 1e-9) / np.maximum(forerun.amplitude[:, None], 1e-9)), 0.0
     )
     megahertz = transducer_hz * 1e-6
-    levels = [np.clip(np.nan_to_num(x, nan=0.0), -5, 60) for x in (candidates.before_db, candidates.after_db)]
-    levels_all = [np.clip(np.nan_to_num(x, nan=0.0), -5, 60) for x in (candidates.before_all_db, candidates.after_all_db)]
+    stretches = np.stack([candidates.before_db, candidates.after_db, candidates.before_all_db, candidates.after_all_db])
+    levels = np.clip(np.nan_to_num(stretches, nan=0.0), -5, 60)
     ordered = np.sort(snr, axis=1)
     features = [
-        snr / 20, candidates.saliences_db / 10, levels[0] / 10, levels[1] / 10, levels_all[0] / 10, levels_all[1] / 10,
-        (levels[0] - levels[1]) / 10, (levels_all[0] - levels_all[1]) / 10, best_before / 15, far_before / 5,
+        snr / 20, candidates.saliences_db / 10, levels[0] / 10, levels[1] / 10, levels[2] / 10, levels[3] / 10,
+        (levels[0] - levels[1]) / 10, (levels[2] - levels[3]) / 10, best_before / 15, far_before / 5,
         best_behind / 15, far_behind / 5, depth / 8, depth * megahertz / 50, multiple, share / 15, over_forerun / 30,
         np.broadcast_to(seen, snr.shape).astype(float), reverberation / 15, candidates.widths_s * transducer_hz,
         (before & (pair > -8)).sum(axis=2) / 3.0, (behind & (pair > -8)).sum(axis=2) / 3.0,
         np.broadcast_to(ordered[:, -1:], snr.shape) / 20, (ordered[:, -1:] - snr) / 15,
-        frequency * 5, lower[0] * 5, lower[1] * 5,
+        frequency * 5, lower[0] * 5, lower[1] * 5, candidates.rise_db / 15, candidates.fall_db / 15,
+        candidates.end_db / 15, own / 15,
     ]  # fmt: skip
     stacked = np.zeros((*snr.shape, len(NAMES)), dtype=np.float32)
     for number, feature in enumerate(features):
@@ -105,9 +106,11 @@ def _multiples(
     return place, share
 
 
-def _reverberations(candidates: Candidates, pair: Floats, before: npt.NDArray[np.bool_]) -> Array:
-    """How much stronger (dB) an earlier echo is of which this one would be the first reverberation under the skin."""
+def _reverberations(candidates: Candidates, pair: Floats, before: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
+    """How much stronger (dB) an earlier echo is of which this one would be the first reverberation under the skin, and how
+    near in strength the echo comes that would be this one's: bone under a flat skin has one."""
     delays = np.nan_to_num(candidates.delays_s)
     off = np.abs(delays[:, :, None] - 2 * delays[:, None, :])
     hit = before & (off < REVERBERATION_TOLERANCE_S)
-    return np.asarray(np.where(hit, np.clip(pair, 0, FAR_DB), 0.0).max(axis=2))
+    earlier = np.where(hit, np.clip(pair, 0, FAR_DB), 0.0).max(axis=2)
+    return earlier, np.where(hit, np.clip(FAR_DB - pair, 0, FAR_DB), 0.0).max(axis=1)

@@ -13,8 +13,9 @@ from ModuleUltrasoundLib.echo_candidates import DECIBEL, Candidates
 from ModuleUltrasoundLib.echo_search import Found
 
 SAME_MM = 0.35  # SD of a hand's tremor along the beam from line to line: how near candidates support each other
-BIN_MM = 0.1
+BIN_MM = 0.2
 REACH = 4  # neighbouring lines on each side
+ROWS = 256  # lines whose scores are worked out at once: the layers stay in the processor's cache
 LEAST_FOR_SHARED = 3  # lines with a likely bone before anything is learnt from the recording
 
 
@@ -34,11 +35,16 @@ class Network:
 
     def scores(self, features: Array) -> Array:
         """Log-odds (n, K) of features (n, K, D)."""
-        x = features.astype(np.float32)
-        for weights, biases in self.layers[:-1]:
-            x = np.tanh(x @ weights + biases)
-        weights, biases = self.layers[-1]
-        return np.asarray((x @ weights + biases)[..., 0], dtype=float)
+        values = np.empty(features.shape[:-1], dtype=float)
+        for start in range(0, len(features), ROWS):
+            x = np.asarray(features[start : start + ROWS], dtype=np.float32)
+            for weights, biases in self.layers[:-1]:
+                x = np.asarray(x @ weights, dtype=np.float32)
+                x += biases
+                np.maximum(x, 0, out=x)  # cheaper than a smooth kink, and as good
+            weights, biases = self.layers[-1]
+            values[start : start + ROWS] = (x @ weights + biases)[..., 0]
+        return values
 
 
 def probabilities(scores: Array, valid: Array) -> tuple[Array, Array]:
@@ -61,6 +67,8 @@ SHARED_NAMES = (
     "has neighbours",
     "contact",
     "slope",
+    "chance",
+    "rival support",
 )
 
 
@@ -75,6 +83,8 @@ def shared_features(found: Found, scores: Array, runs: npt.NDArray[np.int64]) ->
     strength, strength_known, slope = relative_strength(candidates, chance, depth_mm)
     polarity, polarity_known = relative_polarity(candidates.phases - found.forerun_phases[:, None], chance)
     support, neighbours = neighbour_support(chance, depth_mm, runs)
+    order = np.sort(support, axis=1)
+    rival = np.where(support == order[:, -1:], order[:, -2:-1], order[:, -1:])
     features = [
         np.clip(scores, -8, 8) / 4,
         strength,
@@ -85,6 +95,8 @@ def shared_features(found: Found, scores: Array, runs: npt.NDArray[np.int64]) ->
         np.broadcast_to(neighbours[:, None], scores.shape),
         np.broadcast_to(contact(found.forerun.amplitude)[:, None], scores.shape),
         np.full(scores.shape, slope / 3),
+        chance,
+        rival,
     ]
     return np.nan_to_num(np.stack([np.where(valid, feature, 0.0) for feature in features], axis=-1))
 
@@ -133,6 +145,8 @@ def neighbour_support(chance: Array, depth_mm: Array, runs: npt.NDArray[np.int64
     """Mean chance (n, K) that the neighbouring lines give to the same depth, and whether a line has neighbours (n,)."""
     count = len(chance)
     rows = np.arange(count)
+    if count < 2:
+        return np.zeros(chance.shape), np.zeros(count)
     bins = np.nan_to_num(depth_mm / BIN_MM, nan=-1.0).astype(np.int64)
     size = int(bins.max(initial=0)) + 2
     spread = np.zeros((count, size), dtype=np.float32)

@@ -31,11 +31,29 @@ class Found:
     forerun: Forerun
     forerun_phases: Array  # (n,) rad; 0 where no forerun echo was found
     features: Array  # (n, K, D)
+    scores: Array  # (n, K) of `rank`; 0 without it
     depths_mm: Array  # (n, K) at the speed of sound given
     windows: Complexes  # (n, KEPT, W) complex envelope around the first candidates, for the time of flight
     bang: npt.NDArray[np.complex128]  # mean complex envelope of the lines' first samples
     rate_hz: float
     carrier_hz: float
+
+
+def check_length(recording: Recording, speed_m_s: float, least_depth_mm: float) -> None:
+    """Refuse a recording whose lines end before any bone could be seen.
+
+    Raises
+    ------
+    InputError
+        The lines are shorter than the forerun and the least depth, or the header's numbers make them so.
+    """
+    needed_s = nominal_skin_s(recording.acquisition) + least_depth_mm / (500.0 * speed_m_s)
+    covered_s = recording.lines.shape[1] / recording.acquisition.sampling_hz
+    if len(recording) and 0 < covered_s <= needed_s:
+        raise InputError(
+            f"the lines end after {1e6 * covered_s:.3g} us, before bone can be seen ({1e6 * needed_s:.3g} us with the forerun);"
+            " record longer lines, or correct SamplingFrequencyHz or ForerunLengthMm"
+        )
 
 
 Rank = Callable[[Array], Array]  # features (n, K, D) -> scores (n, K)
@@ -66,6 +84,7 @@ def search_lines(
     foreruns: list[Forerun] = []
     phases: list[Array] = []
     features: list[Array] = []
+    scores: list[Array] = []
     windows: list[Complexes] = []
     bang = np.zeros(BANG_SAMPLES, dtype=np.complex128)
     parts = max(-(-len(recording) // CHUNK), 1)
@@ -80,9 +99,12 @@ def search_lines(
         levels = take_levels(magnitude)
         candidates = find_candidates(envelopes, magnitude, levels, forerun.skin_s, window, acquisition.transducer_hz)
         feature = line_features(candidates, forerun, skin, acquisition.transducer_hz, speed_m_s)
+        score = np.zeros(feature.shape[:2]) if rank is None else rank(feature)
         if rank is not None:
-            order = np.argsort(-np.where(np.isfinite(candidates.delays_s), rank(feature), -np.inf), axis=1, kind="stable")
-            candidates, feature = reorder(candidates, order), np.take_along_axis(feature, order[..., None], axis=1)
+            order = np.argsort(-np.where(np.isfinite(candidates.delays_s), score, -np.inf), axis=1, kind="stable")
+            candidates, score = reorder(candidates, order), np.take_along_axis(score, order, axis=1)
+            feature = np.take_along_axis(feature, order[..., None], axis=1)
+        scores.append(score)
         found.append(candidates)
         foreruns.append(forerun)
         phases.append(_forerun_phases(envelopes, forerun))
@@ -100,6 +122,7 @@ def search_lines(
         calm,
         np.concatenate(phases) + np.where(calm.found, turned, 0.0),
         np.concatenate(features),
+        np.concatenate(scores),
         candidates.delays_s * per_s,
         np.concatenate(windows),
         np.asarray(bang / max(len(recording), 1), dtype=np.complex128),

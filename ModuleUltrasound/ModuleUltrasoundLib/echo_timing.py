@@ -17,6 +17,7 @@ Complexes = npt.NDArray[np.complex64]
 
 BEFORE, BEHIND = 10, 16  # samples of an echo's window before and behind its peak (4 a cycle of the transducer)
 CORE = 5  # samples on each side of the peak that are fitted: what follows or comes before may be another interface
+MARGIN = 4  # samples beyond the core that the interpolation reaches
 LEAST_LINES = 5  # echoes from which a pulse is learnt; below, a Gaussian of the typical width stands in
 SURE = 0.9  # probability of an echo that may teach the pulse
 STEADY = 0.8  # mean resultant length of the phases from which on the phase is trusted
@@ -44,17 +45,17 @@ class Timing:
     misfit: Array  # (n,) residual energy over the echo's energy: 0 for a clean copy of the pulse
 
 
-def shift_windows(windows: Complexes, offset: Array) -> npt.NDArray[np.complex128]:
-    """Windows (n, W) moved earlier by `offset` (n,) samples, |offset| <= 1, by cubic interpolation; the ends repeat."""
-    padded = np.pad(windows, ((0, 0), (2, 2)), mode="edge")
+def shift_windows(windows: Complexes, offset: Array) -> Complexes:
+    """Windows (n, W) moved earlier by `offset` (n,) samples, |offset| < 2, by cubic interpolation; the ends repeat."""
     whole = np.floor(offset).astype(np.int64)
-    part = (offset - whole)[:, None]
-    index = np.arange(windows.shape[1]) + 2 + whole[:, None]
-    rows = np.arange(len(padded))[:, None]
-    a, b, c, d = (padded[rows, np.clip(index + k, 0, padded.shape[1] - 1)] for k in (-1, 0, 1, 2))
-    return np.asarray(
-        b + 0.5 * part * (c - a) + part**2 * (a - 2.5 * b + 2 * c - 0.5 * d) + part**3 * (-0.5 * a + 1.5 * b - 1.5 * c + 0.5 * d)
-    )
+    part = (offset - whole).astype(np.float32)[:, None]
+    length = windows.shape[1]
+    index = np.clip(whole[:, None] + np.arange(-1, length + 2), 0, length - 1)
+    near = np.take_along_axis(windows, index, axis=1)
+    a, b, c, d = near[:, :-3], near[:, 1:-2], near[:, 2:-1], near[:, 3:]
+    moved = (0.5 * part) * ((c - a) + part * ((2 * a - 5 * b + 4 * c - d) + part * (3 * (b - c) + d - a)))
+    moved += b
+    return np.asarray(moved, dtype=np.complex64)
 
 
 def learn_pulse(windows: Complexes, offset: Array, chance: Array, rate_hz: float, transducer_hz: float) -> Pulse:
@@ -77,16 +78,18 @@ def fit_echoes(windows: Complexes, offset: Array, pulse: Pulse) -> tuple[Array, 
     Returns the remaining shift of the envelope (samples), its deviation (samples), the phase at the shifted peak (rad), its
     deviation (rad), and the misfit; each of shape (n,).
     """
-    core = slice(BEFORE - CORE, BEFORE + CORE + 1)
-    w = pulse.values[core]
-    slope = np.gradient(pulse.values)[core]
+    w = pulse.values[BEFORE - CORE : BEFORE + CORE + 1].astype(np.complex64)
+    slope = np.gradient(pulse.values)[BEFORE - CORE : BEFORE + CORE + 1].astype(np.complex64)
+    windows = windows[:, BEFORE - CORE - MARGIN : BEFORE + CORE + 1 + MARGIN]
+    core = slice(MARGIN, MARGIN + 2 * CORE + 1)
     shift = np.zeros(len(windows))
-    amplitude: npt.NDArray[np.complex128] = np.zeros(len(windows), dtype=np.complex128)
+    amplitude: npt.NDArray[np.complexfloating] = np.zeros(len(windows), dtype=np.complex128)
     gram = np.array([[np.vdot(w, w), np.vdot(w, slope)], [np.vdot(slope, w), np.vdot(slope, slope)]])
-    inverse = np.linalg.inv(gram)
+    inverse = np.linalg.inv(gram.astype(np.complex128))
+    both = np.stack([w.conj(), slope.conj()], axis=1)
     for _ in range(2):
         y = shift_windows(windows, np.clip(offset + shift, -1.5, 1.5))[:, core]
-        coefficients = np.stack([y @ w.conj(), y @ slope.conj()], axis=1) @ inverse.T
+        coefficients = (y @ both) @ inverse.T
         amplitude = np.asarray(coefficients[:, 0], dtype=np.complex128)
         step = -(coefficients[:, 1] / np.where(amplitude == 0, 1, amplitude)).real
         shift = np.clip(shift + np.clip(step, -0.5, 0.5), -1.0, 1.0)

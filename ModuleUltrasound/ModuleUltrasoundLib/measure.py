@@ -17,7 +17,7 @@ from ModuleUltrasoundLib.echo_likelihood import SHARED_NAMES, Network, probabili
 from ModuleUltrasoundLib.echo_onset import pulse_delay
 from ModuleUltrasoundLib.echo_search import Found, search_lines
 from ModuleUltrasoundLib.echo_timing import time_echoes
-from ModuleUltrasoundLib.echo_weights import SHARED, SINGLE
+from ModuleUltrasoundLib.echo_weights import QUALITY, SHARED, SINGLE
 from ModuleUltrasoundLib.measure_points import bone_points as bone_points
 from ModuleUltrasoundLib.quality import CLIPPED_SHARE, TOLERANCE_MM, choose, clipped_share, quality_of, reasons_of, unstable
 
@@ -74,7 +74,24 @@ def stays(recording: Recording) -> npt.NDArray[np.int64]:
     return np.cumsum(jump)
 
 
-def measure_lines(recording: Recording, settings: EchoSettings | None = None) -> LineMeasurements:
+@dataclass(frozen=True, eq=False)
+class Likelihood:
+    """What was learnt about bone echoes (see echo_weights.py)."""
+
+    single: Network  # of a line by itself
+    both: Network  # with the recording around it
+    quality: tuple[Array, Array]  # quality before calibration, and the share that was right: knots
+
+
+@lru_cache(maxsize=1)
+def learnt() -> Likelihood:
+    """The likelihood that was calibrated on simulated lines."""
+    return Likelihood(Network.from_table(SINGLE), Network.from_table(SHARED), (np.array(QUALITY[0]), np.array(QUALITY[1])))
+
+
+def measure_lines(
+    recording: Recording, settings: EchoSettings | None = None, likelihood: Likelihood | None = None
+) -> LineMeasurements:
     """Depth, bone point, covariance and quality of every frame of a recording.
 
     Raises
@@ -83,26 +100,21 @@ def measure_lines(recording: Recording, settings: EchoSettings | None = None) ->
         The recording's header cannot be that of pulse-echo lines.
     """
     settings = settings or DEFAULT_SETTINGS
+    likelihood = likelihood or learnt()
     runs = stays(recording)
-    single, both = networks()
     found = search_lines(
         recording,
         settings.speed_of_sound_m_s,
         (settings.least_depth_mm, settings.most_depth_mm),
         several_spots=bool(runs.max(initial=0) >= 2),
-        rank=single.scores,
+        rank=likelihood.single.scores,
     )
-    shared = shared_features(found, single.scores(found.features), runs)
-    chance, _ = probabilities(both.scores(np.concatenate([found.features, shared], axis=-1)), np.isfinite(found.depths_mm))
+    shared = shared_features(found, found.scores, runs)
+    scores = likelihood.both.scores(np.concatenate([found.features, shared], axis=-1))
+    chance, _ = probabilities(scores, np.isfinite(found.depths_mm))
     best = choose(found.depths_mm, chance)
     shift_s, sd_s = time_of(found, best, chance, recording.acquisition.transducer_hz)
-    return assemble(recording, settings, found, chance, best, shift_s, sd_s, runs, shared)
-
-
-@lru_cache(maxsize=1)
-def networks() -> tuple[Network, Network]:
-    """The likelihood of a line by itself, and with the recording around it."""
-    return Network.from_table(SINGLE), Network.from_table(SHARED)
+    return assemble(recording, settings, found, chance, best, shift_s, sd_s, runs, shared, likelihood.quality)
 
 
 def time_of(found: Found, best: npt.NDArray[np.int64], chance: Array, transducer_hz: float) -> tuple[Array, Array]:
@@ -136,12 +148,13 @@ def assemble(
     sd_s: Array,
     runs: npt.NDArray[np.int64],
     shared: Array,
+    calibration: tuple[Array, Array],
 ) -> LineMeasurements:
     """The measurements of a recording whose echoes have been judged and timed."""
     rows, speed = np.arange(len(chance)), settings.speed_of_sound_m_s
     depth = found.depths_mm[rows, best] + shift_s * 500 * speed
     sd_mm = sd_s * 500 * speed
-    quality = quality_of(found.depths_mm, best, chance, sd_mm)
+    quality = np.interp(quality_of(found.depths_mm, best, chance, sd_mm), *calibration)
     ok = np.array([status == "OK" for status in recording.statuses], dtype=bool)
     poses = np.where(ok[:, None, None], recording.probe_to_reference, np.nan)
     positions, beams = bone_positions(poses, depth, recording.acquisition.forerun_length_mm)

@@ -18,6 +18,7 @@ from ModuleUltrasoundLib.signal_chain import Envelopes
 
 SEARCH = 0.04  # of the nominal time: temperature changes the delay line's speed by 1 to 3 %, and its length is machined
 SEARCH_S = 4e-7  # on top: the pulse's own delay
+LIKELY = 0.015  # SD of the same: a delay line warmed by 10 degrees; a film or layer behind the face may echo more than it
 LEAST_SNR = 6.0  # envelope peak over the noise of one quadrature
 SAME_S = 1e-7  # lines of one recording show the face this near to each other
 LEAST_SHARE = 0.4  # of a batch's lines must show it
@@ -66,10 +67,15 @@ def find_forerun(envelopes: Envelopes, magnitude: npt.NDArray[np.float32], noise
     last = min(int((nominal * (1 + SEARCH) + SEARCH_S) * rate) + 1, length - 1)
     if nominal == 0.0 or last - first < 3:
         return nothing
-    samples = magnitude[:, first:last].argmax(axis=1)[:, None] + first
+    off = np.arange(first, last) / rate - nominal
+    off = np.maximum(np.maximum(-off, off - 1.5 / acquisition.transducer_hz), 0.0)  # the pulse's own delay is no error
+    prior = np.exp(-0.5 * (off / (LIKELY * nominal)) ** 2).astype(np.float32)
+    window = magnitude[:, first:last]
+    peak = (window >= magnitude[:, first - 1 : last - 1]) & (window >= magnitude[:, first + 1 : last + 1])
+    samples = (peak * window * prior).argmax(axis=1)[:, None] + first
     positions, heights, widths = (values[:, 0] for values in fit_tops(magnitude, samples))
     guard = int(PULSE_CYCLES / acquisition.transducer_hz * rate)
-    index = np.minimum(samples + guard + np.arange(int(BEHIND_S * rate)), length - 1)
+    index = np.minimum(samples + guard + np.arange(0, int(BEHIND_S * rate), 2), length - 1)
     behind = np.exp(np.log(np.take_along_axis(magnitude, index, axis=1) + 1e-3).mean(axis=1))
     times = positions / rate
     expected = (times > nominal - 0.3 / acquisition.transducer_hz) & (times < nominal + 1.5 / acquisition.transducer_hz)

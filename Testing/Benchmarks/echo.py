@@ -2,8 +2,8 @@
 
     python -m Testing.Benchmarks.echo --worlds 300 --seed 7
 
-The worlds are drawn like those of the calibration (Testing/Studies/echo_lines.py) with other seeds. Depths are judged with
-the true speed of sound given.
+The recordings are drawn like those of the calibration, half of them from each family (Testing/Studies/echo_lines.py and
+tissue_lines.py), with other seeds. Depths are judged with the true speed of sound given.
 """
 
 from __future__ import annotations
@@ -12,23 +12,31 @@ import argparse
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 from CranioNavLib.sequence_metafile import Acquisition, Recording
 from ModuleUltrasoundLib.measure import EchoSettings, measure_lines
 
-from Testing.Studies.echo_lines import World, draw_world, simulate
+from Testing.Studies import tissue_lines
+from Testing.Studies.echo_lines import draw_world, simulate
 
 Array = npt.NDArray[np.float64]
 FRAMES = 40
+SYMMETRIC = ("gauss", "ricker", "hann", "chirp")
 
 
 @dataclass(frozen=True, eq=False)
 class Judged:
     """One simulated recording, measured."""
 
-    world: World
+    family: str
+    acquisition: Acquisition
+    pulse: str
+    attenuation: float  # dB/cm/MHz
+    stated_snr_db: float
+    each_line: bool  # the SNR is that of each line's own bone echo
     errors_mm: Array  # depth minus truth; NaN without bone or without an echo
     has_bone: npt.NDArray[np.bool_]
     tilt_deg: Array
@@ -37,13 +45,30 @@ class Judged:
     snr_db: Array
 
 
-def measure_world(seed: int) -> Judged:
+def measure_world(seed: int, family: str = "echo_lines") -> Judged:
     """Simulate and measure one recording."""
     rng = np.random.default_rng(seed)
-    recording, truth, world = simulate(rng, FRAMES)
+    if family == "echo_lines":
+        recording, truth, world = simulate(rng, FRAMES)
+        each_line = world.snr_per_line
+    else:
+        recording, truth, world = tissue_lines.simulate(rng, FRAMES)  # type: ignore[assignment]
+        each_line = world.snr_of == "line"  # type: ignore[attr-defined]
     lines = measure_lines(recording, EchoSettings(speed_of_sound_m_s=truth.speed_m_s))
-    errors = lines.depths_mm - truth.depth_mm
-    return Judged(world, errors, np.isfinite(truth.depth_mm), truth.tilt_deg, lines.qualities, lines.accepted, truth.snr_db)
+    return Judged(
+        family,
+        recording.acquisition,
+        world.pulse,
+        world.attenuation,
+        world.snr_db,
+        each_line,
+        lines.depths_mm - truth.depth_mm,
+        np.isfinite(truth.depth_mm),
+        truth.tilt_deg,
+        lines.qualities,
+        lines.accepted,
+        truth.snr_db,
+    )
 
 
 def rates(judged: list[Judged]) -> dict[str, float]:
@@ -52,6 +77,7 @@ def rates(judged: list[Judged]) -> dict[str, float]:
     accepted = np.concatenate([one.accepted for one in judged])
     bone = np.concatenate([one.has_bone for one in judged])
     near = bone & (np.concatenate([one.tilt_deg for one in judged]) < 3)
+    heard = near & (np.concatenate([one.snr_db for one in judged]) >= 12)
     right = np.abs(np.nan_to_num(errors, nan=99.0))
     count = max(int(accepted.sum()), 1)
     return {
@@ -59,6 +85,7 @@ def rates(judged: list[Judged]) -> dict[str, float]:
         "within 0.5 mm": float((accepted & (right < 0.5)).sum() / count),
         "within 0.25 mm": float((accepted & (right < 0.25)).sum() / count),
         "accepted < 3 deg": float((near & accepted).sum() / max(int(near.sum()), 1)),
+        "and SNR >= 12 dB": float((heard & accepted).sum() / max(int(heard.sum()), 1)),
         "accepted without bone": float((accepted & ~bone).sum() / max(int((~bone).sum()), 1)),
     }
 
@@ -115,18 +142,18 @@ def groups(judged: list[Judged]) -> dict[str, list[Judged]]:
     """The recordings sorted by what makes them hard."""
     return {
         "all": judged,
-        "with forerun": [one for one in judged if one.world.acquisition.forerun_length_mm > 0],
-        "without forerun": [one for one in judged if one.world.acquisition.forerun_length_mm == 0],
-        "symmetric pulse": [one for one in judged if one.world.pulse in ("gauss", "ricker")],
-        "causal pulse": [one for one in judged if one.world.pulse in ("gammatone", "damped")],
-        "SNR 12-20 dB": [one for one in judged if one.world.snr_db < 20],
-        "SNR 20-40 dB": [one for one in judged if one.world.snr_db >= 20],
-        "3-6 MHz": [one for one in judged if one.world.acquisition.transducer_hz < 6e6],
-        "6-10 MHz": [one for one in judged if one.world.acquisition.transducer_hz >= 6e6],
-        "attenuation < 1": [one for one in judged if one.world.attenuation < 1],
-        "attenuation > 1": [one for one in judged if one.world.attenuation >= 1],
-        "SNR of each line": [one for one in judged if one.world.snr_per_line],
-        "SNR of the middle": [one for one in judged if not one.world.snr_per_line],
+        "with forerun": [one for one in judged if one.acquisition.forerun_length_mm > 0],
+        "without forerun": [one for one in judged if one.acquisition.forerun_length_mm == 0],
+        "symmetric pulse": [one for one in judged if one.pulse in SYMMETRIC],
+        "causal pulse": [one for one in judged if one.pulse not in SYMMETRIC],
+        "SNR 12-20 dB": [one for one in judged if one.stated_snr_db < 20],
+        "SNR 20-40 dB": [one for one in judged if one.stated_snr_db >= 20],
+        "3-6 MHz": [one for one in judged if one.acquisition.transducer_hz < 6e6],
+        "6-10 MHz": [one for one in judged if one.acquisition.transducer_hz >= 6e6],
+        "attenuation < 1": [one for one in judged if one.attenuation < 1],
+        "attenuation > 1": [one for one in judged if one.attenuation >= 1],
+        "SNR of each line": [one for one in judged if one.each_line],
+        "SNR of another": [one for one in judged if not one.each_line],
     }
 
 
@@ -137,15 +164,17 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--jobs", type=int, default=2)
     options = parser.parse_args()
-    with ProcessPoolExecutor(options.jobs) as pool:
-        judged = list(pool.map(measure_world, [options.seed * 1_000_003 + i for i in range(options.worlds)], chunksize=4))
-    print("simulated lines, true speed of sound given")
-    for name, some in groups(judged).items():
-        if some:
-            print(f"{name:20}", "  ".join(f"{key} {value:.4g}" for key, value in rates(some).items()))
-    print("quality stated / observed / lines:")
-    for stated, observed, count in calibration(judged):
-        print(f"  {stated:.3f}  {observed:.3f}  {count}")
+    for family in ("echo_lines", "tissue_lines"):
+        seeds = [options.seed * 1_000_003 + i for i in range(options.worlds)]
+        with ProcessPoolExecutor(options.jobs) as pool:
+            judged = list(pool.map(partial(measure_world, family=family), seeds, chunksize=4))
+        print(f"simulated lines of the family {family}, true speed of sound given")
+        for name, some in groups(judged).items():
+            if some:
+                print(f"{name:20}", "  ".join(f"{key} {value:.4g}" for key, value in rates(some).items()))
+        print("quality stated / observed / lines:")
+        for stated, observed, count in calibration(judged):
+            print(f"  {stated:.3f}  {observed:.3f}  {count}")
     print(f"throughput {throughput():.0f} lines/s of 3200 samples on one core; one line alone {1e3 * latency():.2f} ms")
 
 

@@ -20,6 +20,7 @@ def echo(
     from collections import Counter
 
     from CranioNavLib.sequence_metafile import read_recording
+    from ModuleUltrasoundLib.echo_search import check_length
     from ModuleUltrasoundLib.measure import EchoSettings, measure_lines
     from ModuleUltrasoundLib.measure_table import write_depths_csv
 
@@ -30,6 +31,7 @@ def echo(
         lines = read_recording(recording)
         say("looking for bone", 0.3)
         settings = EchoSettings() if speed_of_sound is None else EchoSettings(speed_of_sound_m_s=speed_of_sound)
+        check_length(lines, settings.speed_of_sound_m_s, settings.least_depth_mm)
         measured = measure_lines(lines, settings)
         say("writing", 0.95)
         write_depths_csv(output, lines, measured)

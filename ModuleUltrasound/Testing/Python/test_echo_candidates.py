@@ -45,7 +45,7 @@ def test_faint_lone_echo_is_kept_beside_loud_tissue():
     magnitude = rayleigh(rng, 1.0, (20, 900))
     magnitude += (rayleigh(rng, 300.0, (20, 900)) * np.exp(-np.arange(900) / 60)).astype(np.float32)
     magnitude += bump(700, 15.0).astype(np.float32)
-    samples = salient_peaks(take_levels(magnitude), RATE, 1e6, 20, 800)
+    samples = salient_peaks(take_levels(magnitude), RATE, 1e6, 20, 800, 4e-7)
     assert (np.abs(samples - 700) <= 2).any(axis=1).mean() > 0.95
 
 

@@ -18,7 +18,7 @@ def candidates_at(depths_mm, snrs_db, **others):
     given = {
         "delays_s": np.array(depths_mm) / (500 * SPEED), "amplitudes": 10 ** (np.array(snrs_db) / 20), "phases": 0.0,
         "widths_s": 1e-7, "frequencies_hz": 4.6e6, "saliences_db": 20.0, "before_db": 0.0, "after_db": 0.0,
-        "before_all_db": 0.0, "after_all_db": 0.0, **others,
+        "before_all_db": 0.0, "after_all_db": 0.0, "rise_db": 20.0, "fall_db": 20.0, "end_db": 0.0, **others,
     }  # fmt: skip
     return Candidates(**{name: row(value) for name, value in given.items()}, noise=np.ones(1))
 
@@ -57,6 +57,12 @@ def test_first_reverberation_under_the_skin_names_its_source():
     found = features_of(candidates_at([5.0, 10.0, 13.0], [40.0, 25.0, 25.0]))
     assert found["reverberation"][1] * 15 == pytest.approx(15, abs=1e-3)
     assert found["reverberation"][[0, 2]].max() == 0
+
+
+def test_echo_that_comes_again_at_twice_its_depth_is_marked_by_the_strength_of_the_second():
+    found = features_of(candidates_at([5.0, 10.0, 13.0], [40.0, 25.0, 25.0]))
+    assert found["own reverberation"][0] * 15 == pytest.approx(40 - 15, abs=1e-3)
+    assert found["own reverberation"][1:3].max() == 0
 
 
 def test_frequency_drawn_down_by_tissue_is_seen_against_the_echo_before():

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
+from CranioNavLib.errors import InputError
 from CranioNavLib.sequence_metafile import Acquisition, Recording
 from ModuleUltrasoundLib import echo_search
-from ModuleUltrasoundLib.echo_search import KEPT, search_lines
+from ModuleUltrasoundLib.echo_search import KEPT, check_length, search_lines
 from ModuleUltrasoundLib.echo_timing import BEFORE
 
 ACQUISITION = Acquisition(60e6, 5e6, 20.0, 2340.0)
@@ -46,6 +47,33 @@ def test_windows_are_cut_around_the_first_candidates(a_recording):
     assert found.windows.shape[:2] == (60, KEPT)
     middle = np.abs(found.windows[:, 0, BEFORE])
     assert middle == pytest.approx(found.candidates.amplitudes[:, 0], rel=0.05)
+
+
+def with_lines(recording, lines, acquisition=ACQUISITION):
+    return Recording(
+        lines, acquisition, recording.probe_to_reference, recording.statuses, recording.timestamps_s, recording.palpation_points
+    )
+
+
+@pytest.mark.parametrize("samples", [1, 30, 1025])
+def test_lines_that_end_before_any_bone_are_refused(a_recording, samples):
+    short = with_lines(a_recording, a_recording.lines[:, :samples])
+    with pytest.raises(InputError, match=r"the lines end after .* us, before bone can be seen"):
+        check_length(short, 1540.0, 1.4)
+    assert np.isnan(search_lines(short, 1540.0, (1.4, 20.0), False).depths_mm).all()
+
+
+def test_lines_that_reach_bone_pass(a_recording):
+    check_length(a_recording, 1540.0, 1.4)
+
+
+def test_hum_that_the_line_cuts_off_leaves_no_echo_at_its_end(a_recording):
+    time = np.arange(2900) / ACQUISITION.sampling_hz
+    hum = np.round(4000 * np.sin(2 * np.pi * 1e4 * time + np.arange(60)[:, None]))
+    lines = a_recording.lines + hum.astype(np.int16)
+    calm = search_lines(a_recording, 1540.0, (1.4, 20.0), False, rank=lambda features: features[..., 0])
+    hummed = search_lines(with_lines(a_recording, lines), 1540.0, (1.4, 20.0), False, rank=lambda features: features[..., 0])
+    assert hummed.depths_mm[:, 0] == pytest.approx(calm.depths_mm[:, 0], abs=0.02)
 
 
 def test_depth_is_half_the_way_of_the_sound(a_recording):

@@ -5,7 +5,7 @@ import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition, Recording
-from ModuleUltrasoundLib.measure import EchoSettings, measure_lines, stays
+from ModuleUltrasoundLib.measure import EchoSettings, learnt, measure_lines, stays
 
 SPEED = 1500.0
 
@@ -204,3 +204,20 @@ def test_scalp_of_one_depth_everywhere_is_no_artefact(depth):
     lines = measure_lines(recording, EchoSettings(speed_of_sound_m_s=SPEED))
     assert lines.accepted.mean() > 0.9
     assert np.abs(lines.depths_mm[lines.accepted] - depth).max() < 0.1
+
+
+def test_calibrated_quality_rises_with_the_likelihoods():
+    likelihood, stated = learnt().quality
+    assert likelihood[0] == stated[0] == 0
+    assert likelihood[-1] == 1
+    assert (np.diff(likelihood) > 0).all()
+    assert (np.diff(stated) >= 0).all()
+    assert 0.99 < stated[-1] <= 1
+
+
+def test_quality_is_mapped_by_the_likelihood_that_is_given():
+    recording = record(np.random.default_rng(12), np.full(12, 6.0), SET_UPS["5 MHz, polystyrene"])
+    halved = replace(learnt(), quality=(np.array([0.0, 1.0]), np.array([0.0, 0.5])))
+    straight = replace(learnt(), quality=(np.array([0.0, 1.0]), np.array([0.0, 1.0])))
+    one, other = (measure_lines(recording, likelihood=likelihood).qualities for likelihood in (halved, straight))
+    assert one == pytest.approx(other / 2)

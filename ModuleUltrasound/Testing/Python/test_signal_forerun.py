@@ -47,6 +47,12 @@ def test_bone_and_speckle_are_not_taken_for_the_face():
     assert forerun.skin_s == pytest.approx(np.full(12, SKIN_S))
 
 
+def test_louder_layer_just_behind_the_face_is_not_taken_for_it():
+    forerun = forerun_of(*lines_with([(SKIN_S, -0.1), (SKIN_S + 1e-6, 0.16)]))
+    assert forerun.found.all()
+    assert np.abs(forerun.skin_s - SKIN_S).max() < 1e-8
+
+
 def test_line_whose_face_is_lost_takes_the_others_time():
     height = np.full(12, 0.3)
     height[5] = 0.0
