@@ -154,6 +154,18 @@ def test_bad_landmarks_are_refused_by_name(a_case, capsys, change, message):
     assert message in refusal(capsys, a_case, "--mode", "IIa")
 
 
+def test_a_refused_call_leaves_no_transform_of_an_earlier_one(a_case, capsys):
+    out = a_case / "out"
+    out.mkdir()
+    (out / "ReferenceToRas.tfm").write_text("an earlier result")
+    change_points(a_case / "landmarks-patient.mrk.json", lambda labels, xyz: (labels, xyz / 1000))
+    said = refusal(capsys, a_case, "--mode", "IIa")
+    assert not (out / "ReferenceToRas.tfm").exists()
+    record = json.loads((out / "registration.json").read_text())
+    assert record["status"] == "refused"
+    assert record["messages"][0] in said
+
+
 def test_fewer_than_three_pairs_are_refused(a_case, capsys):
     for name in ("landmarks-patient.mrk.json", "landmarks-ct.mrk.json"):
         change_points(a_case / name, lambda labels, xyz: (labels[:2], xyz[:2]))

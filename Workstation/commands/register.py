@@ -24,20 +24,30 @@ def register(
     A registration that is refused ends with exit status 2 and leaves no transform file.
     """
     from CranioNavLib.case import read_case
+    from CranioNavLib.errors import InputError
     from CranioNavLib.files import output_folder
     from CranioNavLib.plugins import load_file
     from ModuleRegistrationLib.procedure import register_case
+    from ModuleRegistrationLib.registration.problem import METHODS
 
-    from Workstation.outputs import write_outputs
+    from Workstation.outputs import write_failure, write_outputs
     from Workstation.terminal import print_json, progress_bar
 
     for file in load or []:
         load_file(file)
     folder = output_folder(output)
+    found = read_case(case)
+    found.mode(mode)
+    if method:
+        METHODS.find(method)
     with progress_bar() as say:
-        result = register_case(
-            read_case(case), mode, method, segmentation, lambda step, share: say(step, 0.7 * share), limit_mm=limit, series=series
-        )
+        try:
+            result = register_case(
+                found, mode, method, segmentation, lambda step, share: say(step, 0.7 * share), limit_mm=limit, series=series
+            )
+        except InputError as error:  # an earlier call's transform must not pass for this one's
+            write_failure(case, folder, "refused", str(error))
+            raise
         record = write_outputs(result, folder, progress=lambda step, share: say(step, 0.7 + 0.3 * share))
     if json:
         print_json(record)
