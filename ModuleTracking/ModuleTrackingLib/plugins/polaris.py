@@ -24,6 +24,7 @@ from ModuleTrackingLib.ndi.words import DIAGNOSTIC_PENDING
 from ModuleTrackingLib.tracker import ToolInfo, ToolPose, Tracker, TrackerError
 
 NO_NEWS_S = 0.2  # after this long without a good reply, tools are shown as missing
+HAIR_S = 1e-6  # a wait shorter than this may round to none
 LOST_SLICE_S = 0.05  # while the tracker is lost, `read` answers about this often
 LEAVE_S = 1.0  # at most this long is spent on saying good-bye
 ALERT_EVERY_S = 1.0
@@ -232,9 +233,9 @@ class PolarisTracker(Tracker):
             poller.last_good_s = now  # nobody asked until now: no news is no failure
             conductor.begin(poller.next_frame())
         silent_s = now - poller.last_good_s
-        patience_s = LOST_SLICE_S if silent_s >= NO_NEWS_S else NO_NEWS_S - silent_s
+        patience_s = NO_NEWS_S - silent_s if silent_s < NO_NEWS_S - HAIR_S else LOST_SLICE_S
         if not conductor.advance(min(deadline_s, now + patience_s)):
-            if self.clock.now() - poller.last_good_s < NO_NEWS_S - 1e-6:
+            if self.clock.now() - poller.last_good_s < NO_NEWS_S - HAIR_S:
                 return []
             return missing_poses(session.tools, self.clock.now(), "no answer", *([poller.trouble] if poller.trouble else []))
         reply, at_s = conductor.result

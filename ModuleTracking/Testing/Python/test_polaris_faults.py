@@ -104,6 +104,19 @@ def test_a_wait_too_short_for_the_clock_to_tell_ends_all_the_same():
             assert rig.clock.now() > before
 
 
+def test_silence_a_hair_shorter_than_the_limit_is_not_waited_for_in_vain():
+    rig = Rig()
+    with rig.tracker:
+        rig.tracker.read()
+        rig.clock.time_s = 1024.0306918619308  # where the last bit of time is coarser than what is left to wait
+        rig.tracker._conductor.begin(rig.tracker._poller.next_frame())
+        rig.tracker._poller.last_good_s = rig.clock.time_s - 0.1999999999999318
+        rig.station.unplug(rig.clock.now(), 1.0)
+        before = rig.clock.now()
+        assert not any(pose.usable for pose in rig.tracker.read())
+        assert rig.clock.now() > before
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("replies", ["BX", "TX"])
 def test_ten_thousand_corruptions_while_tracking(replies):
