@@ -112,6 +112,7 @@ class Result:
 
 def judge(what: str, rate_hz: float, arrivals: dict[int, float], sent: dict[int, float], processor: float) -> Result:
     """Latencies of the frames that both sides know."""
+    arrivals.pop(-1, None)  # "no answer" has no frame number
     frames = sorted(arrivals)[SKIPPED_FRAMES:]
     missed = set(range(frames[0], frames[-1] + 1)).difference(frames)
     latency = np.array([arrivals[frame] - sent[frame] for frame in frames if frame in sent])
@@ -125,8 +126,8 @@ def measure_driver(rate_hz: float, seconds: float) -> Result:
         with TRACKERS.create("polaris", port=running.url) as tracker:
             began_s, busy_s = time.monotonic(), time.process_time()
             while time.monotonic() < began_s + seconds:
-                poses = tracker.read()
-                arrivals[poses[0].frame_number] = time.monotonic()
+                for pose in tracker.read()[:1]:
+                    arrivals[pose.frame_number] = time.monotonic()
             share = (time.process_time() - busy_s) / (time.monotonic() - began_s)
     return judge("to the tool poses", rate_hz, arrivals, running.times, share)
 
@@ -150,7 +151,7 @@ def measure_node(rate_hz: float, seconds: float, poll_ms: float) -> Result:
                         relative = stream.in_reference_at(pose.tool, pose.host_time_s)
                         if pose.tool != "Reference":
                             scene_data.set_pose(role, relative.tool_to_reference, relative.status.value, pose.host_time_s)
-                        else:
+                        elif pose.usable:
                             scene_data.set_transform("ReferenceToTracker", pose.tool_to_tracker)
                     arrivals[frame[0].frame_number] = time.monotonic()
                 if poll_ms:
