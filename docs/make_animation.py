@@ -54,7 +54,7 @@ class Film:
         """As an animated WebP that repeats."""
         durations = [round(1000 * seconds) for seconds in self.seconds]
         self.pictures[0].save(
-            path, save_all=True, append_images=self.pictures[1:], duration=durations, loop=0, quality=QUALITY, method=6
+            path, save_all=True, append_images=self.pictures[1:], duration=durations, loop=0, quality=QUALITY, method=2
         )
 
 
