@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import importlib.util
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -261,6 +262,8 @@ def main() -> None:
     parser.add_argument("--landmark-sd", type=float, nargs="+", default=[2.3, 6.9])
     parser.add_argument("--trimesh", action="store_true", help="trimesh too: seconds a registration")
     options = parser.parse_args()
+    if options.trimesh and importlib.util.find_spec("rtree") is None:
+        parser.error("--trimesh: trimesh finds closest points with the package rtree, which is not installed")
     if options.surface:
         surface = Surface.read(options.surface)
     else:

@@ -21,7 +21,7 @@ HEAD_RADIUS_MM = 75.0  # turns a rotation into a distance at the skull
 AMBIGUOUS_PROBABILITY, AMBIGUOUS_MM = 0.1, 1.5
 LARGE_RMS_MM, HUGE_RMS_MM = 1.5, 3.0  # of the points used: A-mode and stylus points scatter by 0.3-0.8 mm
 REJECTED_WARNED, REJECTED_REFUSED = 0.3, 0.45  # share of the points
-SCALE_FOUND, SCALE_SIGMAS = 0.01, 3.3
+SCALE_FOUND, SCALE_P = 0.01, 1e-3
 SHARED_SD_MM, SHARED_SPOTS = 0.15, 10  # neighbouring points share errors that look like a scale, however many points there are
 MOVED_MM, MOVED_P = 1.0, 1e-3
 SWEEP_POINTS, SWEEP_MOVED_MM = 60, 2.0  # the biases of single sweeps look like small jumps
@@ -141,7 +141,7 @@ def find_scale_error(problem: RegistrationProblem, result: RegistrationResult) -
     variance = float(np.sum((residuals - stretched @ solution) ** 2)) / freedom + SHARED_SD_MM**2 * len(points) / SHARED_SPOTS
     sd = np.sqrt(variance * np.linalg.pinv(stretched.T @ stretched)[-1, -1])
     stretch = float(solution[-1])
-    if abs(stretch) > SCALE_FOUND and abs(stretch) > SCALE_SIGMAS * sd:
+    if abs(stretch) > SCALE_FOUND and abs(stretch) > special.stdtrit(freedom, 1 - SCALE_P / 2) * sd:
         return [
             Finding(WARNING, f"the points are {1 + stretch:.3f} times the size of the skull; check the unit and the calibration")
         ]
