@@ -36,6 +36,8 @@ def write_outputs(
         say("writing the scene", 0.1)
         fill_scene(result)
         save_scene(folder / "scene.mrb")
+    else:
+        (folder / "scene.mrb").unlink(missing_ok=True)  # an earlier call's is not this one's
     write_report(result, folder / "report.html", versions(), notes, progress=lambda step, share: say(step, 0.4 + 0.6 * share))
     return record
 

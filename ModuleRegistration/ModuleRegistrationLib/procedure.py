@@ -140,7 +140,7 @@ def register_case(
         landmarks_patient_mm=patient,
         points=points,
         registration=registration,
-        verdict=_in_view_of(verdict, confidence),
+        verdict=_in_view_of(verdict, confidence, case),
         targets_ras_mm=targets,
         predicted=predicted,
         ultrasound=ultrasound,
@@ -168,8 +168,11 @@ def _problem(
     )
 
 
-def _in_view_of(verdict: Verdict, confidence: Confidence) -> Verdict:
-    """The verdict, doubted where plausibility points contradict it."""
+def _in_view_of(verdict: Verdict, confidence: Confidence, case: Case) -> Verdict:
+    """The verdict, doubted where plausibility points contradict it, and with what of the case could not be used."""
+    if case.targets_patient is not None and case.targets_ct is None:
+        unused = "targets-patient is not used: there is no targets-ct to compare it with, so no TRE is measured"
+        verdict = replace(verdict, messages=(*verdict.messages, unused))
     touched = confidence.touched
     if touched is None or touched.p_value >= CONTRADICTED_P:
         return verdict

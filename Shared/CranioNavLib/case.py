@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Optional
 
@@ -21,6 +23,7 @@ FILES = {
     "targets-patient": ("targets-patient.mrk.json", "targets-patient.fcsv"),
     "plausibility": ("plausibility.mrk.json", "plausibility.fcsv"),
 }
+LONGEST_PATH = 256  # a longer text under an unknown name is a note; systems refuse to look for a file of such a name
 REQUIRED = ("ct", "landmarks-ct", "landmarks-patient")
 MODES = ("Ia", "Ib", "IIa", "IIb", "III")
 
@@ -75,7 +78,7 @@ def find_files(folder: Path) -> dict[str, Path]:
     Raises
     ------
     InputError
-        No folder, a broken case.json, a redirection that leads nowhere, or something required is missing.
+        No folder, a broken case.json, a mistyped name in it, a redirection that leads nowhere, or something required is missing.
     """
     if not folder.is_dir():
         raise InputError(f"no case folder {folder}; give a folder that holds a CT and the landmark lists")
@@ -115,10 +118,22 @@ def _read_redirections(folder: Path) -> dict[str, str]:
     # a name may be given as the thing ("ct") or as the file it stands for ("landmarks-ct.mrk.json")
     by_name = {name: thing for thing, names in FILES.items() for name in (thing, *names)}
     known = {by_name[key]: value for key, value in redirected.items() if key in by_name}
+    for key in redirected.keys() - by_name.keys():
+        _check_no_redirection(path, key, redirected[key], by_name)
     for thing, value in known.items():
         if not isinstance(value, str):
             raise InputError(f"{path}: {thing} must be a path in quotes, got {value!r}")
     return known
+
+
+def _check_no_redirection(path: Path, key: str, value: object, names: Iterable[str]) -> None:
+    """Refuse a mistyped name, or a file under an unknown one; a note of another kind (a seed, a date) may stand there."""
+    if not isinstance(value, str):
+        return
+    meant = get_close_matches(key.lower(), [name.lower() for name in names], n=1, cutoff=0.7)
+    if meant or (value.strip(" ./") and len(value) < LONGEST_PATH and (path.parent / value).exists()):
+        hint = f"; did you mean {meant[0]!r}?" if meant else ""
+        raise InputError(f"{path}: unknown name {key!r}{hint} (known: {', '.join(FILES)})")
 
 
 def read_case(folder: str | Path) -> Case:

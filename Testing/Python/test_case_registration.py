@@ -154,16 +154,32 @@ def test_bad_landmarks_are_refused_by_name(a_case, capsys, change, message):
     assert message in refusal(capsys, a_case, "--mode", "IIa")
 
 
-def test_a_refused_call_leaves_no_transform_of_an_earlier_one(a_case, capsys):
+RESULT_FILES = ("ReferenceToRas.tfm", "scene.mrb", "report.html")
+
+
+@pytest.mark.parametrize("why", ["landmarks in metres", "no such mode", "no such method", "no such case", "no plugin file"])
+def test_a_refused_call_leaves_no_result_of_an_earlier_one(a_case, capsys, why):
     out = a_case / "out"
     out.mkdir()
-    (out / "ReferenceToRas.tfm").write_text("an earlier result")
-    change_points(a_case / "landmarks-patient.mrk.json", lambda labels, xyz: (labels, xyz / 1000))
-    said = refusal(capsys, a_case, "--mode", "IIa")
-    assert not (out / "ReferenceToRas.tfm").exists()
+    for name in RESULT_FILES:
+        (out / name).write_text("an earlier result")
+    if why == "landmarks in metres":
+        change_points(a_case / "landmarks-patient.mrk.json", lambda labels, xyz: (labels, xyz / 1000))
+    elif why == "no such case":
+        (a_case / "landmarks-ct.mrk.json").unlink()
+    options = {"no such mode": ("--mode", "IV"), "no such method": ("--method", "magic"), "no plugin file": ("--load", "no.py")}
+    said = refusal(capsys, a_case, *options.get(why, ("--mode", "IIa")))
+    assert not [name for name in RESULT_FILES if (out / name).exists()]
     record = json.loads((out / "registration.json").read_text())
     assert record["status"] == "refused"
     assert record["messages"][0] in said
+
+
+def test_patient_targets_without_ct_targets_are_named_as_unused(a_case):
+    (a_case / "targets-ct.mrk.json").unlink()
+    record = computed(a_case, "IIa")
+    assert record["tre_mm"] == []
+    assert any("targets-patient is not used" in message for message in record["messages"])
 
 
 def test_fewer_than_three_pairs_are_refused(a_case, capsys):

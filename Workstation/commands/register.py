@@ -21,32 +21,34 @@ def register(
 ) -> int:
     """Register a case; write the transform, registration.json, scene.mrb and report.html.
 
-    A registration that is refused ends with exit status 2 and leaves no transform file.
+    A registration that is refused ends with exit status 2 and leaves no transform file, not even an
+    earlier one's.
     """
     from CranioNavLib.case import read_case
     from CranioNavLib.errors import InputError
     from CranioNavLib.files import output_folder
     from CranioNavLib.plugins import load_file
     from ModuleRegistrationLib.procedure import register_case
-    from ModuleRegistrationLib.registration.problem import METHODS
 
     from Workstation.outputs import write_failure, write_outputs
     from Workstation.terminal import print_json, progress_bar
 
-    for file in load or []:
-        load_file(file)
     folder = output_folder(output)
-    found = read_case(case)
-    found.mode(mode)
-    if method:
-        METHODS.find(method)
     with progress_bar() as say:
         try:
+            for file in load or []:
+                load_file(file)
             result = register_case(
-                found, mode, method, segmentation, lambda step, share: say(step, 0.7 * share), limit_mm=limit, series=series
+                read_case(case),
+                mode,
+                method,
+                segmentation,
+                lambda step, share: say(step, 0.7 * share),
+                limit_mm=limit,
+                series=series,
             )
-        except InputError as error:  # an earlier call's transform must not pass for this one's
-            write_failure(case, folder, "refused", str(error))
+        except Exception as error:  # whatever ends this call, an earlier one's files must not pass for its result
+            write_failure(case, folder, "refused" if isinstance(error, InputError) else "defect", str(error))
             raise
         record = write_outputs(result, folder, progress=lambda step, share: say(step, 0.7 + 0.3 * share))
     if json:
