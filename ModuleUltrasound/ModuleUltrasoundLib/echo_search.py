@@ -19,7 +19,7 @@ from ModuleUltrasoundLib.signal_forerun import Forerun, find_forerun, nominal_sk
 
 BANG_SAMPLES = 40  # ten cycles
 KEPT = 3  # candidates of a line whose echo is kept sample by sample
-CHUNK = 256  # lines worked on at once: the working set stays in the processor's cache
+CHUNK = 512  # lines worked on at once: enough to spread the cost of a step, few enough for the processor's last cache
 BEHIND_S = 4e-6  # of a line kept behind the deepest bone: what follows an echo speaks for or against it
 
 
