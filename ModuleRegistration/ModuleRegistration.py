@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 _HERE = Path(__file__).resolve().parent
 for _folder in (_HERE, *(_HERE.parent / name for name in ("Shared", "ModuleTracking", "ModuleUltrasound"))):
@@ -28,11 +30,25 @@ from CranioNavLib.point_editor import PointEditor  # noqa: E402
 from ModuleRegistrationLib.anatomy.landmark_suggestions import LABELS  # noqa: E402
 from ModuleRegistrationLib.panel_description import PANEL, RegistrationParameters  # noqa: E402
 
+if TYPE_CHECKING:
+    from ModuleRegistrationLib.registration.problem import RegistrationProblem, RegistrationResult, SurfaceRegistration
+    from ModuleRegistrationLib.registration.verdict import Verdict
+
 LEVELS = {"accepted": Level.GOOD, "warning": Level.WARNING, "refused": Level.BAD, "landmarks": Level.WARNING}
 LEAST_LANDMARKS = 3
 FAR_FROM_TISSUE_MM, AIR_HU = 5.0, -400.0  # a landmark lies on the head, or in a cavity of it that is no wider than twice this
 # on OuterTable: what its segmentation promises
 POSITION_SD, OFFSET_SD, THRESHOLD = "CranioNav.PositionSdMm", "CranioNav.OffsetSdMm", "CranioNav.ThresholdHu"
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceRegistered:
+    """What a surface registration was made of and came to, kept for what asks about it later."""
+
+    problem: RegistrationProblem
+    method: SurfaceRegistration
+    result: RegistrationResult
+    verdict: Verdict
 
 
 class ModuleRegistration(ScriptedLoadableModule):
@@ -61,7 +77,7 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
     def __init__(self, parent=None):
         super().__init__(parent)
-        self.registered = None  # last surface registration: landmarks, result, verdict, predicted TRE
+        self.registered = None  # last surface registration
         self.planned = PointEditor("LandmarksCT", LABELS, self._offTheHead)
 
     # Loading
@@ -377,42 +393,53 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
             predicted = predict_tre_of(result, targets) if result.covariance is not None else None
             return result, judge(problem, result, targets), predicted
 
-        return Task("Register surface", register, lambda done: self._takeSurface(landmarks, problem.points, *done))
+        return Task("Register surface", register, lambda done: self._takeSurface(landmarks, problem, method, *done))
 
     def registerSurfaceBlocked(self):
         """Why the surface cannot be registered now."""
         return self._lacking("OuterTable", "LandmarksCT", "LandmarksPatient", "SurfacePoints")
 
     def _problem(self):
-        from ModuleRegistrationLib.procedure import DEFAULT_TARGETS, spread_over
         from ModuleRegistrationLib.registration.problem import RegistrationProblem
 
         wanted, landmarks = self.parameters().read(), self._landmarks()
         patient, planned, _ = self._pairs("LandmarksPatient", "LandmarksCT")
-        surface, table = scene_data.get_surface("OuterTable"), scene.find("OuterTable")
-        promised = [table.GetAttribute(attribute) for attribute in (POSITION_SD, OFFSET_SD)]
-        known = dict(zip(("surface_sd_mm", "surface_offset_sd_mm"), map(float, promised))) if all(promised) else {}
         problem = RegistrationProblem(
-            surface=surface,
+            surface=scene_data.get_surface("OuterTable"),
             points=scene_data.get_bone_points("SurfacePoints", wanted.palpated_sd_mm),
             initial_reference_to_ras=landmarks.reference_to_ras,
             landmarks_ct_mm=planned,
             landmarks_patient_mm=patient,
-            **known,
+            **self._promised(),
         )
-        if not self._lacking("TargetsCT"):
-            return landmarks, problem, scene_data.get_points("TargetsCT").positions_mm
-        return landmarks, problem, spread_over(surface.vertices_mm, DEFAULT_TARGETS)
+        return landmarks, problem, self._targets()
 
-    def _takeSurface(self, landmarks, points, result, verdict, predicted):
+    def _promised(self):
+        """What the segmentation promises of the outer table, as far as it is known."""
+        table = scene.find("OuterTable")
+        promised = [table.GetAttribute(attribute) for attribute in (POSITION_SD, OFFSET_SD)] if table is not None else [None]
+        return dict(zip(("surface_sd_mm", "surface_offset_sd_mm"), map(float, promised))) if all(promised) else {}
+
+    def _targets(self):
+        """Where the error matters: the targets of the CT, or places all over the outer table, or the landmarks."""
+        from ModuleRegistrationLib.procedure import DEFAULT_TARGETS, spread_over
+
+        for role in ("TargetsCT", "OuterTable", "LandmarksCT"):
+            if not self._lacking(role) and role == "OuterTable":
+                return spread_over(scene_data.get_surface(role).vertices_mm, DEFAULT_TARGETS)
+            if not self._lacking(role):
+                return scene_data.get_points(role).positions_mm
+        raise InputError("there are no targets in the CT to tell an error at; load or find them, or find the bone")
+
+    def _takeSurface(self, landmarks, problem, method, result, verdict, predicted):
         from CranioNavLib.slicer_files import LabelledPoints
         from ModuleRegistrationLib.result_tables import landmark_rows, residual_columns, surface_rows
 
-        rows = {**landmark_rows(landmarks), **surface_rows(result, verdict, predicted)}
+        points, rows = problem.points, {**landmark_rows(landmarks), **surface_rows(result, verdict, predicted)}
         refused = verdict.status == "refused"  # then the landmarks' registration stays, and is shown as no more than that
         matrix, status = (landmarks.reference_to_ras, "landmarks") if refused else (result.reference_to_ras, verdict.status)
         self._setResult(matrix, status, rows, landmarks if refused else result)
-        self.registered = (landmarks, result, verdict, predicted)
+        self.registered = SurfaceRegistered(problem, method, result, verdict)
         scene_data.set_table("Residuals", residual_columns(points, result))
         self._plotResiduals()
         if refused:
@@ -424,31 +451,57 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
     # Verification and results
 
     def verify(self):
-        """Measured TRE at the targets and distance of the plausibility points, whichever there are. Returns a message."""
+        """Measured TRE, distance of the plausibility points, and whether the stated error is right; into Results."""
         from ModuleRegistrationLib.result_tables import verification_rows
-        from ModuleRegistrationLib.verification.plausibility import plausibility
-        from ModuleRegistrationLib.verification.tre import target_errors
+        from ModuleRegistrationLib.verification.checks import verify
 
-        matrix = scene_data.get_transform("ReferenceToRas")
-        errors = distances = None
+        given, labels = self._toVerify()
+
+        def check(progress: Progress):
+            progress("comparing with what the registration has not used", 0.1)
+            return verify(given)
+
+        def take(checks):
+            errors, distances = checks.errors, checks.distances
+            if errors:
+                scene_data.set_table("TargetErrors", {"target": list(labels), "TRE (mm)": errors.errors_mm.tolist()})
+            self._writeRows({**self._rows(), **verification_rows(checks)})
+            said = [f"TRE {errors.mean_mm:.2f} mm (mean), {errors.max_mm:.2f} mm (largest)"] if errors else []
+            said += [f"plausibility {distances.max_mm:.2f} mm (largest)"] if distances else []
+            return "; ".join([*said, *checks.confidence.sentences()])
+
+        return Task("Verify", check, take)
+
+    def _toVerify(self):
+        from ModuleRegistrationLib.verification.checks import StatedError, ToVerify
+
+        error, wanted, labels = scene_data.get_motion_error(), self.parameters().read(), ()
+        given = {
+            "reference_to_ras": scene_data.get_transform("ReferenceToRas"),
+            "targets_ras_mm": self._targets(),
+            "limit_mm": wanted.tre_limit_mm,
+            "touched_sd_mm": wanted.palpated_sd_mm,
+            "stated": StatedError(*error, **self._promised()) if error else None,
+            "surface": self._verifiable(),
+        }
         if not self._lacking("TargetsCT", "TargetsPatient"):
-            patient, planned, labels = self._pairs("TargetsPatient", "TargetsCT")
-            errors = target_errors(matrix, planned, patient)
-            scene_data.set_table("TargetErrors", {"target": list(labels), "TRE (mm)": errors.errors_mm.tolist()})
+            *given["markers"], labels = self._pairs("TargetsPatient", "TargetsCT")
         if not self._lacking("PlausibilityPoints", "Bone"):
-            points = scene_data.get_points("PlausibilityPoints").positions_mm
-            distances = plausibility(matrix, points, scene_data.get_surface("Bone"))
-        self._writeRows({**self._rows(), **verification_rows(errors, distances)})
-        said = [f"TRE {errors.mean_mm:.2f} mm (mean), {errors.max_mm:.2f} mm (largest)"] if errors else []
-        said += [f"plausibility {distances.max_mm:.2f} mm (largest)"] if distances else []
-        return "; ".join(said)
+            given["touched"], given["bone"] = scene_data.get_points("PlausibilityPoints"), scene_data.get_surface("Bone")
+        return ToVerify(**given), labels
+
+    def _verifiable(self):
+        """Problem, result and method of a surface registration that stands; None after landmarks alone or a refusal."""
+        if self.registered is None or self.registered.verdict.status == "refused":
+            return None
+        return self.registered.problem, self.registered.result, self.registered.method
 
     def verifyBlocked(self):
         """Why nothing can be verified now."""
         if not self._status():
             return "register first"
         lacking = self._lacking("TargetsCT", "TargetsPatient"), self._lacking("PlausibilityPoints", "Bone")
-        return "" if "" in lacking else lacking[0]
+        return "" if "" in lacking or self._verifiable() else lacking[0]
 
     def saveResults(self):
         """Write ReferenceToRas.tfm and scene.mrb into `output_folder`. Returns a message."""
@@ -503,6 +556,30 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
         return self._reading(names.PLAUSIBILITY_MAX)
 
+    def belowLimit(self):
+        """Probability that the TRE is below the limit, at the worst target."""
+        from ModuleRegistrationLib import result_tables as names
+
+        return self._said(names.BELOW_LIMIT)
+
+    def touchedPoints(self):
+        """Plausibility points beside what was to be expected of them."""
+        from ModuleRegistrationLib import result_tables as names
+
+        return self._said(names.TOUCHED)
+
+    def heldOutPoints(self):
+        """Points left out of the registration beside what was to be expected of them."""
+        from ModuleRegistrationLib import result_tables as names
+
+        return self._said(names.HELD_OUT)
+
+    def influentialPoint(self):
+        """The point without which the targets would move most."""
+        from ModuleRegistrationLib import result_tables as names
+
+        return self._said(names.INFLUENTIAL)
+
     def verdict(self):
         """Accepted, warning or refused; None before there is a surface registration."""
         from ModuleRegistrationLib import result_tables as names
@@ -533,11 +610,15 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         return StepStatus(StepState.DONE if status == "accepted" else StepState.ATTENTION, rows.get(names.MESSAGE, ""))
 
     def verificationStatus(self):
-        """Whether the registration is verified."""
+        """Whether the registration is verified, or what speaks against its stated error."""
         from ModuleRegistrationLib import result_tables as names
 
         rows = self._rows()
-        return _step(names.TRE_MEAN in rows or names.PLAUSIBILITY_MAX in rows, self.verifyBlocked() or "verify the registration")
+        doubts = [f"{name}: {rows[name]}" for name in (names.TOUCHED, names.HELD_OUT) if names.contradicts(rows.get(name, ""))]
+        if doubts:
+            return StepStatus(StepState.ATTENTION, "; ".join(doubts))
+        verified = any(name in rows for name in (names.TRE_MEAN, names.PLAUSIBILITY_MAX, names.HELD_OUT, names.BELOW_LIMIT))
+        return _step(verified, self.verifyBlocked() or "verify the registration")
 
     # Nodes
 
@@ -599,6 +680,13 @@ class ModuleRegistrationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         words = "".join(_inTenths(rows[part]) if part in rows else part for part in parts)
         return Reading(words, level or LEVELS.get(self._status(), Level.PLAIN))
 
+    def _said(self, name):
+        """A sentence of the Results table; None if there is none."""
+        from ModuleRegistrationLib.result_tables import contradicts
+
+        text = self._rows().get(name)
+        return Reading(text, Level.WARNING if contradicts(text) else Level.PLAIN) if text else None
+
 
 def _inTenths(value):
     """Tenths of a millimetre are what a reader can use; the table and the files keep all digits."""
@@ -654,7 +742,7 @@ class ModuleRegistrationTest(ScriptedLoadableModuleTest):
         assert logic._status() == "landmarks"
         self.delayDisplay(logic.registerSurface().run())
         assert logic._status() in ("accepted", "warning")
-        self.delayDisplay(logic.verify())
+        self.delayDisplay(logic.verify().run())
         errors = scene_data.get_table("TargetErrors")["TRE (mm)"]
         assert len(errors) == len(patient.markers_ras_mm)
         assert sum(errors) / len(errors) < self.LARGEST_MEAN_TRE_MM

@@ -28,6 +28,7 @@ class RegistrationParameters(Parameters):
     landmark_fle_mm: Annotated[float, Limits(0.05, 20), "usual error of one landmark pair (RMS, 3-D)"] = 3.5
     palpated_sd_mm: Annotated[float, Limits(0.05, 5), "error of a point touched with the stylus, per axis"] = 0.5
     method: Annotated[str, "how bone points are laid on the surface"] = "cranionav"
+    tre_limit_mm: Annotated[float, Limits(0.1, 20), "the probability that the TRE stays below this is told"] = 2.0
     output_folder: Annotated[str, "where results are written"] = ""
 
 
@@ -112,14 +113,19 @@ PANEL = Panel(
         Step(
             name="verification",
             title="Verification",
-            help="Compare with markers and bone points that the registration has not used.",
+            help="Compare with markers and bone points not used, and with the registration's own points left out of it.",
             items=(
                 NodeField("TargetsCT", "Targets in the CT"),
                 NodeField("TargetsPatient", "Targets on the patient"),
                 NodeField("PlausibilityPoints", "Plausibility points"),
-                Action("verify", "Verify", "Measured TRE at the targets, distance of the plausibility points", primary=True),
+                ParameterField("tre_limit_mm", "Limit of the TRE"),
+                Action("verify", "Verify", "Measured TRE, plausibility, held-out points; takes some seconds", primary=True),
                 ReadOut("measuredTre", "Measured TRE (mean ± SD; largest)", "mm", large=True),
+                ReadOut("belowLimit", "Probability of a TRE below the limit"),
                 ReadOut("plausibility", "Plausibility (largest surface distance)", "mm"),
+                ReadOut("touchedPoints", "Plausibility points"),
+                ReadOut("heldOutPoints", "Held-out points"),
+                ReadOut("influentialPoint", "Most influential point"),
             ),
             status="verificationStatus",
         ),

@@ -11,8 +11,9 @@ from ModuleRegistrationLib.registration.error_theory import PredictedTre
 from ModuleRegistrationLib.registration.landmarks import LandmarkRegistration
 from ModuleRegistrationLib.registration.problem import RegistrationResult
 from ModuleRegistrationLib.registration.verdict import Verdict
-from ModuleRegistrationLib.verification.plausibility import Plausibility
-from ModuleRegistrationLib.verification.tre import TargetErrors
+from ModuleRegistrationLib.verification.checks import Checks
+from ModuleRegistrationLib.verification.confidence import probability
+from ModuleRegistrationLib.verification.held_out import TOO_SMALL
 
 QUANTITY, VALUE = "quantity", "value"
 METHOD, STATUS, MESSAGE = "method", "status", "message"
@@ -22,6 +23,9 @@ SURFACE_RMS, SPEED = "surface residual (mm, RMS)", "speed of sound (m/s)"
 PREDICTED_MEAN, PREDICTED_P95 = "predicted TRE (mm, mean over targets)", "predicted TRE (mm, 95%, worst target)"
 TRE_MEAN, TRE_SD, TRE_MAX = "TRE (mm, mean)", "TRE (mm, SD)", "TRE (mm, max)"
 PLAUSIBILITY_MEAN, PLAUSIBILITY_MAX = "plausibility distance (mm, mean)", "plausibility distance (mm, max)"
+TOUCHED, HELD_OUT = "plausibility points", "held-out points"  # beside what the stated error lets expect of them
+INFLUENTIAL, BELOW_LIMIT = "most influential point", "probability of a TRE below the limit, worst target"
+NOT_STATED = "the registration states no error, so nothing is known of what to expect"
 
 Rows = dict[str, str]  # quantity -> value, in order
 
@@ -49,14 +53,28 @@ def surface_rows(result: RegistrationResult, verdict: Verdict, predicted: Option
     return rows
 
 
-def verification_rows(tre: Optional[TargetErrors], plausibility: Optional[Plausibility]) -> Rows:
-    """What markers and points that the registration has not used say."""
+def verification_rows(checks: Checks) -> Rows:
+    """What markers, points that the registration has not used, and its own points left out of it say."""
     rows: Rows = {}
+    tre, distances, confidence = checks.errors, checks.distances, checks.confidence
     if tre is not None:
         rows.update({TRE_MEAN: f"{tre.mean_mm:.3f}", TRE_SD: f"{tre.sd_mm:.3f}", TRE_MAX: f"{tre.max_mm:.3f}"})
-    if plausibility is not None:
-        rows.update({PLAUSIBILITY_MEAN: f"{plausibility.mean_mm:.3f}", PLAUSIBILITY_MAX: f"{plausibility.max_mm:.3f}"})
+    if distances is not None:
+        rows.update({PLAUSIBILITY_MEAN: f"{distances.mean_mm:.3f}", PLAUSIBILITY_MAX: f"{distances.max_mm:.3f}"})
+        touched = confidence.touched
+        rows[TOUCHED] = NOT_STATED if touched is None else f"{touched.outcome}; {touched.expectation}"
+    if confidence.below_limit is not None:
+        rows[BELOW_LIMIT] = f"{probability(confidence.below_limit)} for {confidence.limit_mm:g} mm"
+    if confidence.held_out is not None:
+        rows[HELD_OUT] = f"{confidence.held_out.outcome}; {confidence.held_out.expectation}"
+    if confidence.left_out is not None:
+        rows[INFLUENTIAL] = confidence.left_out.influence
     return rows
+
+
+def contradicts(said: str) -> bool:
+    """Whether a row about points and what was expected of them says that the stated error is too small."""
+    return TOO_SMALL in said
 
 
 def residual_columns(points: BonePoints, result: RegistrationResult) -> dict[str, list[object]]:

@@ -151,7 +151,7 @@ def get_surface(role: str) -> Surface:
     if mesh is None or mesh.GetNumberOfPoints() == 0:
         raise InputError(f"{role} in the scene holds no surface; make it first")
     kept, stamp, surface = _surfaces.get(role, (None, 0, None))
-    if surface is None or kept is not mesh or stamp != mesh.GetMTime():
+    if surface is None or stamp != mesh.GetMTime() or kept is not mesh:
         surface = Surface.from_polydata(mesh)
         _surfaces[role] = (mesh, mesh.GetMTime(), surface)
     return surface

@@ -45,10 +45,14 @@ class Confidence:
 
 def probability_words(below_limit: Array, limit_mm: float) -> str:
     """The worst target's probability as a sentence."""
-    worst = float(below_limit.min())
-    probability = "more than 99%" if worst > 0.99 else "less than 1%" if worst < 0.01 else f"{worst:.0%}"
     where = "the worst target" if len(below_limit) > 1 else "the target"
-    return f"the true error at {where} is below {limit_mm:g} mm with a probability of {probability}"
+    return f"the true error at {where} is below {limit_mm:g} mm with a probability of {probability(below_limit)}"
+
+
+def probability(below_limit: Array) -> str:
+    """The worst target's probability in per cent; more digits than these are not known."""
+    worst = float(below_limit.min())
+    return "more than 99%" if worst > 0.99 else "less than 1%" if worst < 0.01 else f"{worst:.0%}"
 
 
 def assess(

@@ -23,6 +23,7 @@ from ModuleRegistrationLib.verification.linear_model import LinearModel, expecte
 
 FOLDS = 6  # of the protocol's 18 points three are left out at a time, from different regions
 LEAST_POINTS, MOST_POINTS = 9, 60  # fewer leave too few to register; the samples of a sweep share their errors
+TOO_SMALL = "the stated error is too small"
 UNLIKELY = 0.01  # p-value below which the distances are called larger than expected
 
 
@@ -42,17 +43,28 @@ class DistanceCheck:
         """Whether the stated errors explain the distances."""
         return self.p_value >= UNLIKELY
 
-    def words(self, what: str) -> str:
-        """The outcome as a sentence about `what` ("the held-out points")."""
+    @property
+    def outcome(self) -> str:
+        """How the points lie, in words; TOO_SMALL stands among them where the stated errors do not explain it."""
         p = f"p = {self.p_value:.2f}" if self.p_value >= UNLIKELY else f"p = {self.p_value:.1g}"
         if self.as_expected:
-            return f"{what} lie as far off as expected ({p})"
+            return f"as far off as expected ({p})"
         worst = int(np.argmax(np.abs(self.distances_mm) / self.expected_sd_mm))
         return (
-            f"{what} lie further off than expected ({p}): the stated error is too small; farthest is "
+            f"further off than expected ({p}): {TOO_SMALL}; farthest is "
             f"{self.labels[worst]}, {abs(self.distances_mm[worst]):.1f} mm off where {self.expected_sd_mm[worst]:.1f} mm (SD) "
             "was expected"
         )
+
+    @property
+    def expectation(self) -> str:
+        """The distribution that was expected, in words."""
+        low, high = (f"{value:.1f}" for value in (self.expected_sd_mm.min(), self.expected_sd_mm.max()))
+        return f"expected: 0 ± {low if low == high else f'{low} to {high}'} mm (mean ± SD)"
+
+    def words(self, what: str) -> str:
+        """The outcome as a sentence about `what` ("the held-out points")."""
+        return f"{what} lie {self.outcome}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +83,15 @@ class LeaveOneOut:
 
     def words(self) -> str:
         """The most influential point as a sentence."""
+        return f"the most influential point is {self.influence}"
+
+    @property
+    def influence(self) -> str:
+        """The most influential point's name and what leaving it out would do."""
         k = self.most_influential
         return (
-            f"the most influential point is {self.labels[k]}: without it the targets would move by up to "
-            f"{self.shifts_mm[k]:.1f} mm, and it would lie {abs(self.residuals_mm[k]):.1f} mm off the bone"
+            f"{self.labels[k]}: without it the targets would move by up to {self.shifts_mm[k]:.1f} mm, "
+            f"and it would lie {abs(self.residuals_mm[k]):.1f} mm off the bone"
         )
 
 

@@ -84,7 +84,7 @@ def test_landmarks_then_surface_then_verification(a_patient):
     assert a_patient.surfaceStatus().state is StepState.TODO
     a_patient.registerSurface().run()
     assert worst_target_error() < min(rough, 0.3)
-    a_patient.verify()
+    a_patient.verify().run()
     errors = scene_data.get_table("TargetErrors")
     assert errors["target"] == ["t1", "t2", "t3"], "paired by label"
     assert max(errors["TRE (mm)"]) == pytest.approx(worst_target_error(), abs=1e-6)
@@ -100,7 +100,7 @@ def test_landmarks_then_surface_then_verification(a_patient):
 def test_a_saved_scene_shows_the_same_results(a_patient, tmp_path):
     a_patient.registerLandmarks()
     a_patient.registerSurface().run()
-    a_patient.verify()
+    a_patient.verify().run()
     model = PanelModel(PANEL, a_patient)
     before = {step.name: model.status(step) for step in PANEL.steps}
     readings = (a_patient.fre(), a_patient.verdict(), a_patient.measuredTre(), a_patient.predictedTre())
@@ -111,7 +111,7 @@ def test_a_saved_scene_shows_the_same_results(a_patient, tmp_path):
     logic = again.logic
     assert (logic.fre(), logic.verdict(), logic.measuredTre(), logic.predictedTre()) == readings
     assert logic.parameters().read().method == "icp"
-    logic.verify()
+    logic.verify().run()
 
 
 def test_a_refused_surface_registration_leaves_the_landmarks_and_says_so(a_patient, monkeypatch):
@@ -128,10 +128,55 @@ def test_a_refused_surface_registration_leaves_the_landmarks_and_says_so(a_patie
     assert scene.find("RegisteredPoints") is None
 
 
+def test_verification_shows_what_speaks_for_and_against_the_stated_error(a_patient):
+    a_patient.parameters().change(method="cranionav", tre_limit_mm=20.0)
+    a_patient.registerLandmarks()
+    a_patient.registerSurface().run()
+    said = a_patient.verify().run()
+    assert a_patient.belowLimit().text == "more than 99% for 20 mm"
+    assert a_patient.heldOutPoints().text.startswith("as far off as expected (p = ")
+    assert "targets would move by up to" in a_patient.influentialPoint().text
+    assert a_patient.touchedPoints().text.startswith("as far off as expected (p = ")
+    assert "expected: 0 ± " in a_patient.touchedPoints().text
+    assert a_patient.verificationStatus().state is StepState.DONE
+    assert "the held-out points lie as far off as expected" in said
+    a_patient.parameters().change(tre_limit_mm=0.1)
+    a_patient.verify().run()
+    assert a_patient.belowLimit().text.endswith("% for 0.1 mm")
+    assert not a_patient.belowLimit().text.startswith("more than 99%")
+
+
+def test_touched_bone_far_off_where_the_stated_error_is_small_asks_for_attention(a_patient):
+    a_patient.parameters().change(method="cranionav")
+    a_patient.registerLandmarks()
+    a_patient.registerSurface().run()
+    points = scene_data.get_points("PlausibilityPoints")
+    away = points.positions_mm * (1 + 8 / np.linalg.norm(points.positions_mm - invert_rigid(TRUTH)[:3, 3], axis=1)[:, None])
+    scene_data.set_points("PlausibilityPoints", LabelledPoints(points.labels, away))
+    a_patient.verify().run()
+    assert a_patient.touchedPoints().level is Level.WARNING
+    status = a_patient.verificationStatus()
+    assert status.state is StepState.ATTENTION
+    assert "further off than expected" in status.text
+
+
+def test_the_held_out_points_alone_can_be_verified(a_patient):
+    for role in ("TargetsCT", "TargetsPatient", "PlausibilityPoints"):
+        scene.release(role)
+    a_patient.registerLandmarks()
+    assert "missing" in a_patient.verifyBlocked()
+    a_patient.parameters().change(method="cranionav")
+    a_patient.registerSurface().run()
+    assert a_patient.verifyBlocked() == ""
+    a_patient.verify().run()
+    assert a_patient.heldOutPoints() is not None
+    assert a_patient.verificationStatus().state is StepState.DONE
+
+
 def test_a_new_registration_forgets_what_was_measured_of_the_old_one(a_patient):
     a_patient.registerLandmarks()
     a_patient.registerSurface().run()
-    a_patient.verify()
+    a_patient.verify().run()
     a_patient.registerLandmarks()
     assert a_patient.measuredTre() is None
     assert a_patient.verdict() is None

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from CranioNavLib.surface import Surface
-from ModuleRegistrationLib.registration.closest_field import find_feet
+from ModuleRegistrationLib.registration.closest_field import find_feet, find_feet_on_planes
 
 PLATE = Surface(np.array([[0.0, 0, 0], [20, 0, 0], [20, 20, 0], [0, 20, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
 
@@ -27,3 +27,13 @@ def test_the_direction_is_the_gradient_of_the_distance(a_skull: Surface) -> None
         for step in np.eye(3) * 0.01
     ]
     assert np.einsum("ij,ij->i", np.array(slopes).T, feet.directions) == pytest.approx(1, abs=0.03)
+
+
+def test_planes_find_nearly_the_exact_distance(a_skull: Surface) -> None:
+    rng = np.random.default_rng(4)
+    chosen = a_skull.triangles[rng.choice(len(a_skull.triangles), 200, replace=False)]
+    points = a_skull.vertices_mm[chosen].mean(axis=1) + rng.normal(0, 2, (200, 3))
+    exact, quick = find_feet(a_skull, points), find_feet_on_planes(a_skull, points)
+    over_bone = ~exact.at_edge & ~quick.at_edge
+    assert over_bone.mean() > 0.9
+    assert np.mean(np.abs(exact.distances_mm - quick.distances_mm)[over_bone]) < 0.15

@@ -2,11 +2,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from CranioNavLib.rigid import transform_points
+from CranioNavLib.bone_points import BonePoints
+from CranioNavLib.rigid import invert_rigid, transform_points
+from CranioNavLib.surface import Surface
 from ModuleRegistrationLib.registration.landmarks import fit_rigid
 from ModuleRegistrationLib.registration.next_point import plan_next_points, region_name
 from ModuleRegistrationLib.registration.problem import METHODS, Minimum
 from ModuleRegistrationLib.registration.verdict import Limits, judge
+from vtkmodules.vtkFiltersSources import vtkSphereSource
 
 METHOD = METHODS.create("cranionav")
 
@@ -132,3 +135,19 @@ def test_a_planned_point_brings_what_it_promises(a_case, a_skull) -> None:
 )
 def test_regions_are_named_as_a_surgeon_would(point: list[float], name: str) -> None:
     assert region_name(np.array(point, dtype=float), np.zeros(3)) == name
+
+
+def test_points_on_a_sphere_are_never_accepted(a_case) -> None:
+    source = vtkSphereSource()
+    source.SetRadius(80)
+    source.SetThetaResolution(120)
+    source.SetPhiResolution(120)
+    source.Update()
+    problem = a_case(3).problem
+    arms = np.random.default_rng(1).normal(size=(18, 3))
+    touched = 80.3 * arms / np.linalg.norm(arms, axis=1, keepdims=True)
+    points = BonePoints.palpated(transform_points(invert_rigid(problem.initial_reference_to_ras), touched), 0.5)
+    on_ball = replace(problem, surface=Surface.from_polydata(source.GetOutput()), points=points)
+    verdict = judged(on_ball, touched[:5])
+    assert verdict.status != "accepted"
+    assert "one sphere" in " ".join(verdict.messages)
