@@ -21,6 +21,8 @@ from CranioNavLib.files import written_whole
 from CranioNavLib.rigid import Array, check_points
 
 PLANES = 12000  # one every 2 to 3 mm of a skull's outer table
+SPACE = "SPACE"  # the name under which model files tell their axes: without it 3D Slicer takes them for LPS
+LPS_RAS = np.array([-1.0, -1.0, 1.0])
 READERS = {".vtp": "vtkXMLPolyDataReader", ".ply": "vtkPLYReader", ".stl": "vtkSTLReader", ".vtk": "vtkPolyDataReader"}
 
 
@@ -198,6 +200,8 @@ class Surface:
     def read(cls, path: str | Path) -> Surface:
         """A surface from .vtp, .ply, .stl or .vtk, in RAS and mm.
 
+        A file that says that it is in LPS, as 3D Slicer writes them, is turned to RAS; one that says nothing is in RAS.
+
         Raises
         ------
         InputError
@@ -218,20 +222,37 @@ class Surface:
         reader.Update()
         if reader.GetOutput() is None or reader.GetOutput().GetNumberOfPoints() == 0:
             raise InputError(f"{path} holds no surface; it is empty, cut off or of another format")
-        return cls.from_polydata(reader.GetOutput())
+        surface = cls.from_polydata(reader.GetOutput())
+        return cls(surface.vertices_mm * LPS_RAS, surface.triangles) if "LPS" in _space(reader) else surface
 
     def write(self, path: str | Path) -> None:
         """Write .vtp (RAS, mm, outward normals), whole or not at all."""
+        from vtkmodules.vtkCommonCore import vtkStringArray
         from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
+        space, mesh = vtkStringArray(), self.to_polydata()
+        space.SetName(SPACE)
+        space.InsertNextValue("RAS")
+        mesh.GetFieldData().AddArray(space)
         with written_whole(path) as temporary:
             writer = vtkXMLPolyDataWriter()
             writer.SetFileName(str(temporary))
-            writer.SetInputData(self.to_polydata())
+            writer.SetInputData(mesh)
             writer.EncodeAppendedDataOff()  # with LZ4 0.35 s for a whole skull instead of 6, in 37 MB instead of 28
             writer.SetCompressorTypeToLZ4()
             if not writer.Write():
                 raise InputError(f"cannot write {path}; is the disk full?")
+
+
+def _space(reader: Any) -> str:
+    """What a model file says of its axes, in the places where 3D Slicer writes it; "" if it says nothing."""
+    said = reader.GetOutput().GetFieldData().GetAbstractArray(SPACE)
+    if said is not None and said.GetNumberOfValues():
+        return str(said.GetValue(0))
+    comments = reader.GetComments() if hasattr(reader, "GetComments") else None
+    texts = [] if comments is None else [comments.GetValue(k) for k in range(comments.GetNumberOfValues())]
+    texts += [reader.GetHeader() or ""] if hasattr(reader, "GetHeader") else []
+    return next((text for text in texts if f"{SPACE}=" in text), "")
 
 
 def _unit(vectors: Array) -> Array:

@@ -11,6 +11,10 @@ from vtkmodules.vtkCommonCore import reference
 from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 from vtkmodules.vtkFiltersSources import vtkCubeSource, vtkSphereSource
 
+TETRAHEDRON = Surface(
+    np.array([[10.0, 20, 30], [50, 22, 31], [12, 70, 33], [14, 24, 90]]), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+)
+
 
 @pytest.fixture(scope="module")
 def a_sphere() -> Surface:
@@ -82,3 +86,32 @@ def test_the_content_hash_tells_surfaces_apart(a_sphere):
     moved = Surface(a_sphere.vertices_mm + 1e-9, a_sphere.triangles)
     assert moved.content_hash != a_sphere.content_hash
     assert Surface(a_sphere.vertices_mm.copy(), a_sphere.triangles).content_hash == a_sphere.content_hash
+
+
+@pytest.mark.parametrize("extension", [".vtp", ".stl", ".ply", ".vtk"])
+@pytest.mark.parametrize("space", ["LPS", "RAS"])
+def test_a_model_saved_by_slicer_lies_where_slicer_had_it(tmp_path, extension, space):
+    from CranioNavLib import host
+
+    host.scene().Clear(False)
+    node = host.scene().AddNewNodeByClass("vtkMRMLModelNode")
+    node.SetAndObservePolyData(TETRAHEDRON.to_polydata())
+    storage = host.scene().AddNewNodeByClass("vtkMRMLModelStorageNode")
+    storage.SetCoordinateSystem(storage.GetCoordinateSystemFromString(space))
+    storage.SetFileName(str(tmp_path / f"m{extension}"))
+    assert storage.WriteData(node)
+    found = Surface.read(tmp_path / f"m{extension}")
+    assert np.allclose(found.center_mm, TETRAHEDRON.center_mm, atol=1e-4)
+    assert np.allclose(found.closest(TETRAHEDRON.vertices_mm).distances_mm, 0, atol=1e-4)
+    assert np.sum(found.triangle_normals * (found.vertices_mm[found.triangles].mean(axis=1) - found.center_mm)) > 0
+
+
+def test_slicer_loads_a_written_surface_where_it_lies(tmp_path):
+    from CranioNavLib import host
+
+    TETRAHEDRON.write(tmp_path / "m.vtp")
+    node = host.scene().AddNewNodeByClass("vtkMRMLModelNode")
+    storage = host.scene().AddNewNodeByClass("vtkMRMLModelStorageNode")
+    storage.SetFileName(str(tmp_path / "m.vtp"))
+    assert storage.ReadData(node)
+    assert np.allclose(Surface.from_polydata(node.GetPolyData()).vertices_mm, TETRAHEDRON.vertices_mm, atol=1e-4)
