@@ -9,6 +9,7 @@ from CranioNavLib import host, scene, scene_data
 from CranioNavLib.bone_points import BonePoints
 from CranioNavLib.slicer_files import LabelledPoints
 from ModuleRegistrationLib import result_tables
+from ModuleRegistrationLib.verification.checks import Checks
 
 if TYPE_CHECKING:
     from ModuleRegistrationLib.procedure import CaseResult
@@ -27,6 +28,8 @@ def fill_scene(result: CaseResult) -> None:
     registration = scene_data.set_transform("ReferenceToRas", np.eye(4) if refused else result.registration.reference_to_ras)
     if not refused:
         registration.SetAttribute(scene.STATUS_ATTRIBUTE, result.verdict.status)
+        found = result.registration
+        scene_data.set_motion_error(found.covariance, found.pivot_ras_mm, found.degrees_of_freedom)
     labels = result.landmarks.labels
     scene_data.set_points("LandmarksCT", LabelledPoints(labels, result.landmarks_ct_mm))
     scene_data.set_points("LandmarksPatient", LabelledPoints(labels, result.landmarks_patient_mm))
@@ -42,7 +45,7 @@ def fill_scene(result: CaseResult) -> None:
     tables = result_tables
     rows = {"mode": result.mode, **tables.landmark_rows(result.landmarks)}
     rows.update(tables.surface_rows(result.registration, result.verdict, result.predicted))
-    rows.update(tables.verification_rows(result.tre, result.plausibility))
+    rows.update(tables.verification_rows(Checks(result.tre, result.plausibility, result.confidence)))
     scene_data.set_table("Results", {tables.QUANTITY: list(rows), tables.VALUE: list(rows.values())})
     if len(result.points):
         scene_data.set_table("Residuals", tables.residual_columns(result.points, result.registration))

@@ -11,10 +11,13 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 from CranioNavLib.files import write_text, written_whole
 
 if TYPE_CHECKING:
     from ModuleRegistrationLib.procedure import CaseResult
+    from ModuleRegistrationLib.verification.checks import StatedError
     from ModuleRegistrationLib.verification.held_out import DistanceCheck
 
 SUMMARY_COLUMNS = (
@@ -79,8 +82,8 @@ def verification_record(result: CaseResult) -> dict[str, Any]:
         "limit_mm": confidence.limit_mm,
         "targets_ras_mm": result.targets_ras_mm.tolist(),
         "probability_below_limit": None if below is None else below.tolist(),
-        "held_out": _check_record(confidence.held_out),
-        "plausibility": _check_record(confidence.touched),
+        "held_out": check_record(confidence.held_out),
+        "plausibility": check_record(confidence.touched),
         "leave_one_out": None
         if left_out is None
         else {
@@ -102,7 +105,24 @@ def verification_record(result: CaseResult) -> dict[str, Any]:
     }
 
 
-def _check_record(check: DistanceCheck | None) -> dict[str, Any] | None:
+def read_stated_error(transform: Path, reference_to_ras: npt.ArrayLike) -> StatedError | None:
+    """What the registration.json beside a transform states of its error; None if there is none, or of another transform."""
+    from ModuleRegistrationLib.verification.checks import StatedError
+
+    try:
+        record = json.loads((transform.parent / "registration.json").read_text(encoding="utf-8"))
+        stated, bone = record["verification"], record["verification"]["bone_surface"]
+        covariance, pivot = np.array(stated["covariance"], dtype=float), np.array(stated["pivot_ras_mm"], dtype=float)
+        if not np.allclose(record["reference_to_ras"], reference_to_ras, atol=1e-4):
+            return None
+        freedom, sds = stated["degrees_of_freedom"], (float(bone["position_sd_mm"]), float(bone["offset_sd_mm"]))
+        known = covariance.shape == (6, 6) and pivot.shape == (3,) and np.isfinite([*covariance.flat, *pivot, *sds]).all()
+        return StatedError(covariance, pivot, None if freedom is None else float(freedom), *sds) if known else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def check_record(check: DistanceCheck | None) -> dict[str, Any] | None:
     if check is None:
         return None
     return {
