@@ -94,7 +94,8 @@ class ModuleUltrasoundLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         for axis, name in enumerate(NORMALS):
             scene_data.add_measurement(node, name, planned.normals[:, axis])
         self._goTo(0)
-        return f"{len(planned.labels)} points"
+        missing = f"; no bone to stand on for {', '.join(planned.left_out)}" if planned.left_out else ""
+        return f"{len(planned.labels)} points{missing}"
 
     def planProtocolBlocked(self):
         """Why no points can be placed now."""

@@ -33,6 +33,7 @@ PAIRS = {
     "Periorbital 1": (20.0, 11.0),  # above the supraorbital rim
     "Periorbital 2": (36.0, -21.0),  # body of the zygoma, below and beside the orbit
 }
+MOST_LEFT_OUT = 4  # a craniotomy takes the place of one or two points; more are missing where the CT is cut off
 WINDOW_RADII_DEG = (12.0, 17.0, 23.0)  # tried in turn: a window that holds a defect or a clamp is widened
 GRID_STEP_DEG = 1.8
 
@@ -62,6 +63,7 @@ class ProtocolPoints:
     normals: Array  # (N, 3) unit, of the plane through the bone under the probe
     regions: tuple[str, ...]
     head_to_ras: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) origin at the nasion, x right, y anterior, z up
+    left_out: tuple[str, ...] = ()  # labels of points whose place is taken by an opening of the skull
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -95,12 +97,13 @@ def plan_protocol(
     Returns
     -------
     ProtocolPoints
-        Three left lateral, three right lateral, four each on frontal convexity, forehead and around the orbits.
+        Three left lateral, three right lateral, four each on frontal convexity, forehead and around the orbits; without
+        those whose place, and all around it, is an opening of the skull.
 
     Raises
     ------
     InputError
-        Landmarks and labels differ in number, or the surface lacks a region of the protocol.
+        Landmarks and labels differ in number, or the surface lacks a region of the protocol or more than four places.
     """
     head_to_ras = _head_frame(surface, landmarks_ras_mm, labels)
     center, reach = _middle(surface, head_to_ras)
@@ -108,10 +111,14 @@ def plan_protocol(
     for name in PAIRS:
         for side in (-1, 1):
             windows[name, side] = _spots_for(surface, head_to_ras, center, reach, name, side)
+    left_out = _check_left_out(windows)
+    windows = {key: spots for key, spots in windows.items() if spots}
     chosen = _choose(windows, center)
     names, spots, regions = [], [], []
     for region in REGIONS:
         for label, key in _slots(region):
+            if key in left_out:
+                continue
             names.append(label)
             spots.append(chosen[key])
             regions.append(region)
@@ -121,7 +128,21 @@ def plan_protocol(
         normals=np.array([spot.normal for spot in spots]),
         regions=tuple(regions),
         head_to_ras=head_to_ras,
+        left_out=tuple(label for region in REGIONS for label, key in _slots(region) if key in left_out),
     )
+
+
+def _check_left_out(windows: dict[tuple[str, int], list[_Spot]]) -> list[tuple[str, int]]:
+    """The windows over an opening, which hold no place; refused where there are many, or all of a region."""
+    empty = [key for key, spots in windows.items() if not spots]
+    bare = any(all(key in empty for _, key in _slots(region)) for region in REGIONS)
+    if bare or len(empty) > MOST_LEFT_OUT:
+        name, side = empty[0]
+        raise InputError(
+            f"no place for the probe at {'left' if side < 0 else 'right'} {name.lower()}: the bone surface is missing or too "
+            "rough there; extend or mend the surface, or check the landmarks that orient the head"
+        )
+    return empty
 
 
 def _slots(region: str) -> list[tuple[str, tuple[str, int]]]:
@@ -227,7 +248,7 @@ def _directions(name: str, side: int, radius_deg: float) -> tuple[Array, list[tu
 
 
 def _spots_for(surface: Surface, head_to_ras: Array, center: Array, reach: float, name: str, side: int) -> list[_Spot]:
-    """Places of a window where a probe can stand; the window grows until it holds some."""
+    """Places of a window where a probe can stand; the window grows until it holds some, or is left empty."""
     for radius_deg in WINDOW_RADII_DEG:
         rays, places = _directions(name, side, radius_deg)
         outward = transform_directions(head_to_ras, rays)
@@ -244,11 +265,7 @@ def _spots_for(surface: Surface, head_to_ras: Array, center: Array, reach: float
         ]
         if spots:
             return spots
-    where = f"{'left' if side < 0 else 'right'} {name.lower()}"
-    raise InputError(
-        f"no place for the probe at {where}: the bone surface is missing or too rough there; "
-        "extend or mend the surface, or check the landmarks that orient the head"
-    )
+    return []
 
 
 def probe_footprint(surface: Surface, positions_mm: Array, outward: Array) -> tuple[Array, Array, Array, npt.NDArray[np.bool_]]:
@@ -314,20 +331,26 @@ def _rows(spots: Sequence[_Spot], center: Array) -> Array:
 def _choose(windows: dict[tuple[str, int], list[_Spot]], center: Array) -> dict[tuple[str, int], _Spot]:
     """One spot a window, so that the mean squared error over the head is least; both sides alike where they can be."""
     chosen = {key: min(spots, key=lambda spot: spot.penalty) for key, spots in windows.items()}
-    pairings = {name: _pairings(windows[name, -1], windows[name, 1]) for name in PAIRS}
+    found = {name: _pairings(windows.get((name, -1), []), windows.get((name, 1), [])) for name in PAIRS}
+    pairings = {name: pairs for name, pairs in found.items() if pairs}
     for _ in range(4):
         before = dict(chosen)
-        for name in PAIRS:
+        for name in pairings:
             others = [spot for key, spot in chosen.items() if key[0] != name]
             best = int(np.argmin(_costs(pairings[name], others, center)))
-            chosen[name, -1], chosen[name, 1] = pairings[name][best]
+            chosen.update({(name, side): spot for side, spot in zip((-1, 1), pairings[name][best]) if (name, side) in chosen})
         if all(before[key] is chosen[key] for key in chosen):
             break
     return chosen
 
 
 def _pairings(left: list[_Spot], right: list[_Spot]) -> list[tuple[_Spot, _Spot]]:
-    """Pairs of spots that mirror each other; where the other side has no bone, its best spots near by stand in."""
+    """Pairs of spots that mirror each other; where the other side has no bone, its best spots near by stand in.
+
+    A spot that has no partner at all is paired with itself.
+    """
+    if not (left and right):
+        return [(spot, spot) for spot in left or right]
     by_place = {spot.offset: spot for spot in right}
     mirrored = [(spot, by_place[spot.offset]) for spot in left if spot.offset in by_place]
     if len(mirrored) >= 5:

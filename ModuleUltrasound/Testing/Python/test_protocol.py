@@ -122,6 +122,18 @@ def test_a_hole_in_the_bone_is_kept_clear_of():
     assert np.linalg.norm(plan.positions_ras_mm - hole, axis=1).min() > 22.0 + 5.0
 
 
+@pytest.mark.parametrize("place", [[28.0, -12.0, 42.0], [62.0, -60.0, 30.0]])
+def test_over_a_craniotomy_no_point_is_planned_and_the_missing_ones_are_named(a_skull, place):
+    whole = plan_protocol(a_skull, LANDMARKS)
+    hole = whole.positions_ras_mm[np.argmin(np.linalg.norm(whole.positions_ras_mm - place, axis=1))]
+    plan = plan_protocol(a_head(lambda middles: np.linalg.norm(middles - hole, axis=1) > 40.0), LANDMARKS)
+    assert np.linalg.norm(plan.positions_ras_mm - hole, axis=1).min() > 40.0 + 5.0
+    assert 1 <= len(plan.left_out) <= 4
+    assert set(plan.labels) | set(plan.left_out) == set(whole.labels)
+    assert len(plan) == 18 - len(plan.left_out)
+    assert not whole.left_out
+
+
 def test_an_open_face_without_the_back_of_the_head_is_enough():
     plan = plan_protocol(a_head(lambda middles: middles[:, 1] > -150.0), LANDMARKS)
     assert len(plan) == 18
