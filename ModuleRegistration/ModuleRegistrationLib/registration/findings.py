@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array, transform_points
 from scipy import special
@@ -112,15 +113,23 @@ def find_bad_fit(result: RegistrationResult) -> list[Finding]:
 
 
 def find_inconsistent_points(problem: RegistrationProblem, result: RegistrationResult) -> list[Finding]:
-    """Which points contradict the others."""
+    """Which points contradict the others, and which of those hang over a hole."""
     rejected = np.flatnonzero(~result.used)
     if not len(rejected):
         return []
     share = len(rejected) / len(result.used)
     status = REFUSED if share > REJECTED_REFUSED else WARNING if share > REJECTED_WARNED else ACCEPTED
-    names = [problem.points.labels[i] for i in rejected[:6]]
-    more = f" and {len(rejected) - 6} more" if len(rejected) > 6 else ""
-    return [Finding(status, f"{len(rejected)} of {len(result.used)} points contradict the others: {', '.join(names)}{more}")]
+    text = f"{len(rejected)} of {len(result.used)} points contradict the others: {_names(problem, rejected)}"
+    over = rejected[find_feet(problem.surface, result.points_ras_mm[rejected]).at_edge]
+    if len(over):
+        text += f"; of these over an opening or beyond the edge of the bone: {_names(problem, over)}"
+    return [Finding(status, text)]
+
+
+def _names(problem: RegistrationProblem, which: npt.NDArray[np.int64]) -> str:
+    """Labels of points, not all of them where they are many."""
+    more = f" and {len(which) - 6} more" if len(which) > 6 else ""
+    return ", ".join(problem.points.labels[i] for i in which[:6]) + more
 
 
 def _linearised(problem: RegistrationProblem, result: RegistrationResult) -> tuple[Array, Array, Array, Array]:
