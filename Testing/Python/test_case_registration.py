@@ -75,7 +75,7 @@ def test_a_registered_case_leaves_record_transform_scene_and_report(a_case, tmp_
     node = host.scene().GetFirstNodeByName("SurfacePoints")
     assert node.GetParentTransformNode().GetName() == "ReferenceToRas"
     page = (tmp_path / "out" / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/png;base64,") == 5
     assert re.findall(r'(?:src|href)="(?!data:)', page) == []
     assert "not a medical device" in page
 

@@ -67,6 +67,7 @@ def _figures(result: CaseResult, say: Callable[[str, float], None]) -> dict[str,
     drawings = {
         "skull": report_figures.skull_with_points,
         "error_map": report_figures.error_map,
+        "error_slices": report_figures.error_slices,
         "slices": report_figures.slices_with_points,
         "lines": report_figures.lines_with_echo,
     }

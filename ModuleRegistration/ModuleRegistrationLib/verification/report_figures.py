@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +24,8 @@ VIEW_PIXELS = 430
 RESIDUAL_COLORS = "RdBu_r"  # told apart by the colour-blind too
 MESH_BINS = 140  # a side of the skull: 1.3 mm, about two pixels
 POINT_RADIUS_MM = 3.0
+AIR_HU = -400.0  # below it there is no head
+COARSE_MM = 4  # the error to expect changes slowly; between such steps it is interpolated
 LANDMARK_COLOR, TARGET_COLOR = "#e69f00", "#009e73"
 
 
@@ -152,6 +155,67 @@ def slices_with_points(result: CaseResult) -> bytes:
             axes.invert_xaxis()  # radiological: the patient's right is on the left
     figure.tight_layout()
     return _png(figure)
+
+
+def error_slices(result: CaseResult) -> bytes | None:
+    """Slices through the worst target, coloured inside the head by the error to expect there; None as for `error_map`."""
+    from matplotlib.figure import Figure
+
+    if result.registration.covariance is None or result.predicted is None:
+        return None
+    place = result.bone.outer_table.center_mm
+    if result.case.targets_ct is not None:
+        place = result.targets_ras_mm[int(np.argmax(result.predicted.p95_mm))]
+    cuts = [_error_cut(result, place, axis) for axis in (2, 1, 0)]
+    highest = max(float(np.nanmax(cut.p95_mm, initial=0.5)) for cut in cuts)
+    figure = Figure(figsize=(14, 4.6), dpi=110, layout="constrained")
+    plots = figure.subplots(1, len(cuts))
+    for axes, cut, name in zip(plots, cuts, ("axial", "coronal", "sagittal")):
+        across, up = [k for k in range(3) if k != cut.axis]
+        axes.imshow(cut.hu, cmap="gray", vmin=-400, vmax=1600, extent=cut.extent, origin="lower", interpolation="bilinear")
+        limits = {"vmin": 0, "vmax": np.ceil(2 * highest) / 2}
+        painted = axes.imshow(cut.p95_mm, cmap="viridis", **limits, extent=cut.extent, origin="lower", alpha=0.65)
+        if cut.hu.max() > result.bone.threshold_hu:
+            axes.contour(cut.hu, levels=[result.bone.threshold_hu], colors="white", linewidths=0.5, extent=cut.extent)
+        axes.plot(place[across], place[up], "+", color="white", markersize=14, markeredgewidth=2)
+        axes.set_title(f"{name}, {'RAS'[cut.axis]} = {place[cut.axis]:.0f} mm", fontsize=9)
+        axes.set_xlabel(f"{'RAS'[across]} (mm)", fontsize=8)
+        axes.tick_params(labelsize=7)
+        if cut.axis != 0:
+            axes.invert_xaxis()  # radiological: the patient's right is on the left
+    figure.colorbar(painted, ax=plots, shrink=0.8, label="95% error to expect (mm)")
+    return _png(figure)
+
+
+@dataclass(frozen=True, eq=False)
+class _ErrorCut:
+    """An axis-aligned slice and the 95% error to expect in it; NaN outside the head."""
+
+    axis: int
+    hu: Array  # (B, A)
+    p95_mm: Array  # (B, A)
+    extent: tuple[float, float, float, float]
+
+
+def _error_cut(result: CaseResult, place: Array, axis: int) -> _ErrorCut:
+    from scipy.ndimage import binary_fill_holes, label, map_coordinates
+
+    from ModuleRegistrationLib.registration.error_theory import predict_tre_of
+
+    across, up = [k for k in range(3) if k != axis]
+    hu, extent = _resampled_slice(result.volume.hu, result.volume.ijk_to_ras, place, axis, across, up)
+    parts, _ = label(hu > AIR_HU)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    inside = binary_fill_holes((parts == np.argmax(sizes)) & (parts > 0))  # the head, not the table under it
+    rows, columns = (np.arange(0, size + COARSE_MM, COARSE_MM) for size in hu.shape)  # a slice has 1 mm pixels
+    ras = np.empty((len(rows), len(columns), 3))
+    ras[..., axis] = place[axis]
+    ras[..., across], ras[..., up] = extent[0] + columns[None, :], extent[2] + rows[:, None]
+    coarse = predict_tre_of(result.registration, ras.reshape(-1, 3)).p95_mm.reshape(ras.shape[:2])
+    p95 = map_coordinates(coarse, np.indices(hu.shape) / COARSE_MM, order=1)
+    p95[~inside] = np.nan
+    return _ErrorCut(axis, hu, p95, extent)
 
 
 def _resampled_slice(
