@@ -84,8 +84,10 @@ def test_the_whole_procedure_is_done_by_clicks(tmp_path, pictures):
         assert float(re.search(r"TRE (\d+\.\d+) mm \(mean\)", said).group(1)) < 2.0  # simulated; the chapter's worst mode: 2.78
         user.picture("7-verification")
         user.next("verification")
+        before = user.slices()
         user.press("navigation", "tourTargets")
         user.sees("navigation", r"To the bone\s+\d+\.\d mm")
+        user.waits_until(lambda: all(now != then for now, then in zip(user.slices(), before, strict=True)))  # all follow the tip
         user.picture("8-navigation")
         user.next("navigation")
         user.press("report", "writeReport")

@@ -163,6 +163,14 @@ def test_many_requests_become_one_picture():
     assert painted_of(ask) == ["a"]
 
 
+def test_slices_are_free_to_follow_while_a_tool_keeps_the_3d_view_busy():
+    painter = Painter()
+    skull = PacedRendering("skull", Scheduler("skull", []), painter, 90)
+    skull.schedule_render()
+    assert painter.waits_for(frozenset({"skull"}))
+    assert not painter.waits_for(frozenset({"axial", "sagittal"}))
+
+
 def test_a_busy_view_does_not_keep_the_others_from_being_painted():
     async def ask(views: Any, _: Any) -> None:
         for _ in range(40):

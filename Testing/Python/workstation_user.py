@@ -7,7 +7,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -71,6 +71,18 @@ class User:
     def reading(self, step: str, name: str) -> str:
         """What a read-out shows."""
         return str(self.page.locator(f"[data-panel={step}] [data-reading={name}]").first.inner_text())
+
+    def slices(self) -> list[str]:
+        """Where the slices stand, by the sliders below them."""
+        return [str(slider.get_attribute("aria-valuenow")) for slider in self.page.locator("[role=slider]").all()]
+
+    def waits_until(self, holds: Callable[[], bool]) -> None:
+        """Look again and again."""
+        for _ in range(PATIENCE_MS // 500):
+            if holds():
+                return
+            self.page.wait_for_timeout(500)
+        raise AssertionError("waited in vain")
 
     def digitise_landmarks(self) -> None:
         """Let the simulated hand touch each landmark and read it, as the screen says."""

@@ -66,11 +66,8 @@ class WorkstationApp(TrameApp):
         self.views, self.cues = ViewFollower(self.slicer), Cues()
         self.controls = ViewControls(self.server, self.layouts, self.views.fit)
         self.server.state.legend, self.server.state.cue, self.server.state.muted = None, {}, False
-        self.server.state.live, self.server.state.files, self.server.state.simulated = (
-            drawings(self.logics[ULTRASOUND]),
-            [],
-            False,
-        )
+        self.server.state.live = drawings(self.logics[ULTRASOUND])
+        self.server.state.files, self.server.state.simulated = [], False
         self.files = FilesDialog(self.server, self.places, self._load_ct, self.runner.start)
         with built_once():
             self.page = Page(self.server, self.panels, self.layouts, PROCEDURE)
@@ -107,12 +104,12 @@ class WorkstationApp(TrameApp):
         self.layouts.set_layout("four")
         self.painter = Painter()
         paced = pace(self.slicer.view_manager.get_views(), self.painter, PICTURE_QUALITY)
+        self._slices = frozenset(view.get_view_node_id() for view in self.slicer.view_manager.get_slice_views())
         for view in self.slicer.view_manager.get_threed_views():
             paced[view.get_view_node_id()].draw_with(MovingPicture(view, lambda: self.views.moving_models()))
 
     def _use_folder(self) -> None:
         """The modules write into the session's folder unless the user says otherwise."""
-        self.logics[TRACKING].parameters().change(calibration_folder=str(self.session.folder))
         self.logics[TRACKING].parameters().change(calibration_folder=str(self.session.folder))
         self.logics[ULTRASOUND].parameters().change(recording_path=self.session.recording_path)
         self.logics[REGISTRATION].parameters().change(output_folder=str(self.session.folder))
@@ -151,8 +148,8 @@ class WorkstationApp(TrameApp):
         self.painter.muted = False
 
     def _move(self, turn: int) -> None:
-        """Let the views follow the tool, as soon as what was there before is painted."""
-        if self.server.state.step == "navigation" and self.painter.idle:
+        """Let the slices follow the tool, as soon as they show where it was before."""
+        if self.server.state.step == "navigation" and not self.painter.waits_for(self._slices):
             with self.painter.while_moving():
                 self._navigate()
 

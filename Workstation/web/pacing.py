@@ -39,10 +39,9 @@ class Painter:
         finally:
             self.moving = False
 
-    @property
-    def idle(self) -> bool:
-        """Whether everything that was asked for is painted."""
-        return not self._wanted
+    def waits_for(self, names: frozenset[str]) -> bool:
+        """Whether one of these views is still to be painted."""
+        return not names.isdisjoint(self._wanted)
 
     def ask(self, name: str, view: PacedRendering) -> None:
         """A view wants to be painted."""
