@@ -146,9 +146,7 @@ def measure_start(runs: int) -> None:
                     user.page.locator("[data-panel=ct] [data-action=layPatient]:not([disabled])").wait_for()
                     seconds.append(time.monotonic() - begun)
                     cpu.append(_cpu_s(process.pid))
-    print(
-        f"start to usable page: {_spread(seconds)} s, of it {np.median(cpu):.1f} s processor time of the server (limit 6; {load()})"
-    )
+    print(f"start to usable page: {_spread(seconds)} s, the server's processor time {np.median(cpu):.1f} s (limit 6; {load()})")
 
 
 def measure_ct() -> None:
@@ -216,24 +214,27 @@ def measure_latency(seconds: float) -> None:
 
 def measure_memory(minutes: float) -> None:
     """Growth of the server's memory while a tool is tracked and drawn."""
-    with tempfile.TemporaryDirectory() as scratch:
-        with served(Path(scratch) / "session") as (url, process, _), watched_browser() as user:
-            navigate(user, url)
-            user.page.wait_for_timeout(15_000)
-            at, used = [], []
-            begun = time.monotonic()
-            while time.monotonic() < begun + 60 * minutes:
-                at.append((time.monotonic() - begun) / 60)
-                used.append(_memory_mb(process.pid))
-                if user.page.locator("[data-panel=navigation] [data-action=tourTargets]:not([disabled])").count():
-                    user.press("navigation", "tourTargets")
-                user.page.evaluate("window.seenPictures.length = 0")
-                user.page.wait_for_timeout(20_000)
-            growth = np.polyfit(at, used, 1)[0]
-            print(
-                f"memory: {used[0]:.0f} MB at first, {used[-1]:.0f} MB after {at[-1]:.1f} minutes; {growth:+.2f} MB a minute, "
-                f"so {used[0] + 60 * growth:.0f} MB after an hour (limit 2500; {load()})"
-            )
+    with (
+        tempfile.TemporaryDirectory() as scratch,
+        served(Path(scratch) / "session") as (url, process, _),
+        watched_browser() as user,
+    ):
+        navigate(user, url)
+        user.page.wait_for_timeout(15_000)
+        at, used = [], []
+        begun = time.monotonic()
+        while time.monotonic() < begun + 60 * minutes:
+            at.append((time.monotonic() - begun) / 60)
+            used.append(_memory_mb(process.pid))
+            if user.page.locator("[data-panel=navigation] [data-action=tourTargets]:not([disabled])").count():
+                user.press("navigation", "tourTargets")
+            user.page.evaluate("window.seenPictures.length = 0")
+            user.page.wait_for_timeout(20_000)
+        growth = np.polyfit(at, used, 1)[0]
+        print(
+            f"memory: {used[0]:.0f} MB at first, {used[-1]:.0f} MB after {at[-1]:.1f} minutes; {growth:+.2f} MB a minute, "
+            f"so {used[0] + 60 * growth:.0f} MB after an hour (limit 2500; {load()})"
+        )
 
 
 def navigate(user: Any, url: str) -> None:

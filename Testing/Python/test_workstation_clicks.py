@@ -131,3 +131,15 @@ def test_layouts_windows_sounds_and_help_by_keys(tmp_path):
         page.keyboard.press("b")
         page.locator("[data-panel=ct]").wait_for()
         assert user.defects == []
+
+
+@needs_browser
+@pytest.mark.slow
+def test_one_click_after_typing_is_enough(tmp_path):
+    with user_module.served(tmp_path / "session", True) as (url, _), user_module.browsing() as user:
+        user.open(url)
+        field = user.page.locator("[data-panel=ct] [data-field=ct_path] input")
+        field.fill("nowhere.nrrd")
+        field.press("Enter")
+        user.press("ct", "loadCt")  # the field loses the focus in this very click
+        user.sees("ct", "no CT at nowhere.nrrd")

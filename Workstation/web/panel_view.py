@@ -148,6 +148,7 @@ class PanelView:
             "label": label_of(self.model.panel, item),
             "model_value": (f"{self.key}.fields['{item.name}']",),
             "hint": info.help,
+            "persistent_hint": True,  # one that goes with the focus moves the button away from under a click
             "error_messages": (f"{self.key}.errors['{item.name}']",),
             "density": "compact",
             "variant": "outlined",
@@ -207,6 +208,7 @@ class PanelView:
                 "label": ("one.name.replaceAll('_', ' ')",),
                 "model_value": ("one.value",),
                 "hint": ("one.help",),
+                "persistent_hint": True,
                 "error_messages": (f"{self.key}.errors[one.key]",),
                 "density": "compact",
                 "variant": "outlined",
