@@ -52,7 +52,8 @@ def solve(problem: RegistrationProblem, stages: tuple[Stage, ...], samples: int)
     if dense:
         solution = _solve_dense(model, minima, scores, problem, steps + more)
     else:
-        solution = _solve_sparse(model, minima, scores, covariances, samples, rng, steps + more)
+        draws = np.random.default_rng((problem.seed, samples))  # not what the search left over: alike problems, alike draws
+        solution = _solve_sparse(model, minima, scores, covariances, samples, draws, steps + more)
     return _result(problem, model, solution)
 
 

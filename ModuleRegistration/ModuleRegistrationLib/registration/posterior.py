@@ -60,16 +60,18 @@ def sample_posterior(
     size = covariances.shape[-1] if model.speed_sd > 0 else covariances.shape[-1] - 1  # a known speed is not drawn
     share = np.maximum(np.exp(scores.min() - scores), LEAST_SHARE)
     share = share / share.sum()
-    origin = rng.choice(len(share), size=count, p=share)
-    origin[: len(share)] = np.arange(len(share))
+    # in pairs to both sides of a minimum: their mean is that of the minimum itself but for what is not symmetric
+    pairs = (count + 1) // 2
+    origin = np.repeat(np.searchsorted(np.cumsum(share)[:-1], (np.arange(pairs) + 0.5) / pairs), 2)
+    count = len(origin)
     roots = np.asarray(np.linalg.cholesky(covariances[:, :size, :size] * PROPOSAL_STRETCH**2), dtype=np.float64)
-    heavy = np.sqrt(PROPOSAL_FREEDOM / rng.chisquare(PROPOSAL_FREEDOM, count))
-    draws = (roots[origin] @ rng.standard_normal((count, size, 1)))[..., 0] * heavy[:, None]
+    sides = np.tile([1.0, -1.0], pairs) * np.repeat(np.sqrt(PROPOSAL_FREEDOM / rng.chisquare(PROPOSAL_FREEDOM, pairs)), 2)
+    draws = (roots[origin] @ np.repeat(rng.standard_normal((pairs, size, 1)), 2, axis=0))[..., 0] * sides[:, None]
     state = State(
         rigid_from_vector(draws[:, :3], draws[:, 3:6], model.pivot) @ minima.motion[origin],
         minima.offset[origin] + draws[:, 6],
         minima.speed[origin] + (draws[:, 7] if size == PARAMETERS else 0.0),
-        minima.scale[origin] * np.exp(rng.normal(0, LOG_SCALE_SD, count)),
+        minima.scale[origin] * np.exp(np.repeat(rng.normal(0, LOG_SCALE_SD, pairs), 2)),
         np.full(count, minima.outliers[0]),
     )
     proposal = np.stack([_log_density(model, minima, roots, k, state) + np.log(share[k]) for k in range(len(share))])
