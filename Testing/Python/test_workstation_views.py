@@ -13,7 +13,7 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from Workstation.web import color_scale, error_views, framing
 from Workstation.web.drawn_models import CoarseCopy
 from Workstation.web.point_styles import STYLES, PointStyles
-from Workstation.web.tool_models import ErrorRing
+from Workstation.web.tool_models import ErrorRing, ToolModels
 
 
 @pytest.fixture
@@ -228,6 +228,18 @@ def test_the_ring_has_the_size_of_the_error_and_goes_without_one(an_empty_scene)
     np.testing.assert_allclose(np.diff(bounds, axis=1)[:, 0] / 2, 2.5, rtol=0.02)
     ring.show(np.array([10.0, -20, 30]), None)
     assert not node.GetDisplayNode().GetVisibility()
+
+
+def test_a_lost_tool_is_not_drawn_where_it_was(an_empty_scene):
+    scene.find_or_create("ReferenceToRas").SetAttribute(scene.STATUS_ATTRIBUTE, "accepted")
+    tools = ToolModels()
+    scene_data.set_pose("StylusToReference", np.eye(4), "OK", 1.0)
+    tools.refresh(0.0)
+    (drawn,) = tools.nodes()
+    assert drawn.GetDisplayNode().GetVisibility()
+    scene_data.set_pose("StylusToReference", None, "MISSING", 1.3)
+    tools.refresh(0.0)
+    assert not drawn.GetDisplayNode().GetVisibility()
 
 
 def test_the_slices_cross_where_they_were_sent(an_empty_scene):

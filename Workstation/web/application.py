@@ -148,7 +148,8 @@ class WorkstationApp(TrameApp):
         self.painter.muted = False
 
     def _move(self, turn: int) -> None:
-        """Let the slices follow the tool, as soon as they show where it was before."""
+        """Hide lost tools; let the slices follow the leading one, as soon as they show where it was before."""
+        self.views.show_tools(self._forerun_mm())
         if self.server.state.step == "navigation" and not self.painter.waits_for(self._slices):
             with self.painter.while_moving():
                 self._navigate()

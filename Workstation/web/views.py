@@ -44,7 +44,7 @@ class ViewFollower:
             outer.GetDisplayNode().SetVisibility(False)  # it lies on Bone: drawing both shows nothing more
         legend = self._errors.refresh(self._bone.node, error_shown if step in WITH_ERROR else "")
         self._points.refresh(step, legend is not None and error_shown == RESIDUALS, asked_for)
-        self._tools.refresh(forerun_mm)
+        self.show_tools(forerun_mm)
         slice_views.show_crossing(step in WITH_CROSSING and scene.find("CT") is not None)
         if self._zoomed and step != "navigation":
             self._zoomed = False
@@ -57,6 +57,10 @@ class ViewFollower:
     def fit(self) -> None:
         """Frame all views anew."""
         self._framing.fit()
+
+    def show_tools(self, forerun_mm: float) -> None:
+        """Show the tools in view and no others: a lost one is gone at once."""
+        self._tools.refresh(forerun_mm)
 
     def follow(self, tip_ras_mm: Any, zoom: bool) -> None:
         """Let all slices pass through a point; or show its surroundings alone."""
