@@ -18,8 +18,8 @@ A_LINE = f"""
     stroke-dasharray="3 3"/><text :x="live.line.skin + 3" y="11" fill="#cfd8dc" font-size="11">{words.SKIN}</text></g>
   <g v-if="live.line.bone !== null"><line :x1="live.line.bone" :x2="live.line.bone" y1="0" y2="{HEIGHT}"
     :stroke="live.line.accepted ? '{GOOD}' : '{WARNING}'" stroke-width="2"/>
-    <text :x="live.line.bone + 3" y="{HEIGHT - 4}"
-    :fill="live.line.accepted ? '{GOOD}' : '{WARNING}'" font-size="11">{words.BONE}{{{{ live.line.accepted ? '' : '?' }}}}</text></g>
+    <text :x="live.line.bone + 3" y="{HEIGHT - 4}" font-size="11"
+    :fill="live.line.accepted ? '{GOOD}' : '{WARNING}'">{words.BONE}{{{{ live.line.accepted ? '' : '?' }}}}</text></g>
   <text x="0" y="{HEIGHT + 12}" fill="#b0bec5" font-size="11">{words.A_LINE_HINT}</text>
 </svg>"""
 BULLS_EYE = f"""
