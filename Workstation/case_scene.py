@@ -8,7 +8,8 @@ import numpy as np
 from CranioNavLib import host, scene, scene_data
 from CranioNavLib.bone_points import BonePoints
 from CranioNavLib.slicer_files import LabelledPoints
-from ModuleRegistrationLib import result_tables
+from ModuleRegistrationLib import result_tables as tables
+from ModuleRegistrationLib.quantities import QUANTITY, VALUE
 from ModuleRegistrationLib.verification.checks import Checks
 
 if TYPE_CHECKING:
@@ -42,11 +43,10 @@ def fill_scene(result: CaseResult) -> None:
     ):
         if points is not None:
             scene_data.set_points(role, points)
-    tables = result_tables
     rows = {"mode": result.mode, **tables.landmark_rows(result.landmarks)}
     rows.update(tables.surface_rows(result.registration, result.verdict, result.predicted))
     rows.update(tables.verification_rows(Checks(result.tre, result.plausibility, result.confidence)))
-    scene_data.set_table("Results", {tables.QUANTITY: list(rows), tables.VALUE: list(rows.values())})
+    scene_data.set_table("Results", {QUANTITY: list(rows), VALUE: list(rows.values())})
     if len(result.points):
         scene_data.set_table("Residuals", tables.residual_columns(result.points, result.registration))
     scene_data.set_text("Report", "\n".join([f"{result.case.name}: {result.verdict.status}", *result.verdict.messages]))

@@ -7,24 +7,14 @@ from typing import Optional
 import numpy as np
 from CranioNavLib.bone_points import BonePoints
 
+from ModuleRegistrationLib import quantities as names
 from ModuleRegistrationLib.registration.error_theory import PredictedTre
 from ModuleRegistrationLib.registration.landmarks import LandmarkRegistration
 from ModuleRegistrationLib.registration.problem import RegistrationResult
 from ModuleRegistrationLib.registration.verdict import Verdict
 from ModuleRegistrationLib.verification.checks import Checks
 from ModuleRegistrationLib.verification.confidence import probability
-from ModuleRegistrationLib.verification.held_out import TOO_SMALL
 
-QUANTITY, VALUE = "quantity", "value"
-METHOD, STATUS, MESSAGE = "method", "status", "message"
-FRE, FLE = "FRE (mm, RMS of the landmarks)", "landmark error FLE (mm, RMS, estimated)"
-POINTS_USED, POINTS_REJECTED = "points used", "points rejected"
-SURFACE_RMS, SPEED = "surface residual (mm, RMS)", "speed of sound (m/s)"
-PREDICTED_MEAN, PREDICTED_P95 = "predicted TRE (mm, mean over targets)", "predicted TRE (mm, 95%, worst target)"
-TRE_MEAN, TRE_SD, TRE_MAX = "TRE (mm, mean)", "TRE (mm, SD)", "TRE (mm, max)"
-PLAUSIBILITY_MEAN, PLAUSIBILITY_MAX = "plausibility distance (mm, mean)", "plausibility distance (mm, max)"
-TOUCHED, HELD_OUT = "plausibility points", "held-out points"  # beside what the stated error lets expect of them
-INFLUENTIAL, BELOW_LIMIT = "most influential point", "probability of a TRE below the limit, worst target"
 NOT_STATED = "the registration states no error, so nothing is known of what to expect"
 
 Rows = dict[str, str]  # quantity -> value, in order
@@ -32,24 +22,24 @@ Rows = dict[str, str]  # quantity -> value, in order
 
 def landmark_rows(landmarks: LandmarkRegistration) -> Rows:
     """What landmark registration alone says."""
-    return {FRE: f"{landmarks.fre_mm:.3f}", FLE: f"{landmarks.fle_mm:.3f}"}
+    return {names.FRE: f"{landmarks.fre_mm:.3f}", names.FLE: f"{landmarks.fle_mm:.3f}"}
 
 
 def surface_rows(result: RegistrationResult, verdict: Verdict, predicted: Optional[PredictedTre]) -> Rows:
     """What surface registration and its verdict say."""
     rows = {
-        METHOD: result.method,
-        STATUS: verdict.status,
-        MESSAGE: "; ".join(verdict.messages),
-        POINTS_USED: str(int(result.used.sum())),
-        POINTS_REJECTED: str(int((~result.used).sum())),
-        SURFACE_RMS: f"{result.surface_rms_mm:.3f}",
+        names.METHOD: result.method,
+        names.STATUS: verdict.status,
+        names.MESSAGE: "; ".join(verdict.messages),
+        names.POINTS_USED: str(int(result.used.sum())),
+        names.POINTS_REJECTED: str(int((~result.used).sum())),
+        names.SURFACE_RMS: f"{result.surface_rms_mm:.3f}",
     }
     if np.isfinite(result.speed_of_sound_m_s):
-        rows[SPEED] = f"{result.speed_of_sound_m_s:.0f}"
+        rows[names.SPEED] = f"{result.speed_of_sound_m_s:.0f}"
     if predicted is not None:
-        rows[PREDICTED_MEAN] = f"{predicted.mean_mm.mean():.3f}"
-        rows[PREDICTED_P95] = f"{predicted.p95_mm.max():.3f}"
+        rows[names.PREDICTED_MEAN] = f"{predicted.mean_mm.mean():.3f}"
+        rows[names.PREDICTED_P95] = f"{predicted.p95_mm.max():.3f}"
     return rows
 
 
@@ -58,23 +48,18 @@ def verification_rows(checks: Checks) -> Rows:
     rows: Rows = {}
     tre, distances, confidence = checks.errors, checks.distances, checks.confidence
     if tre is not None:
-        rows.update({TRE_MEAN: f"{tre.mean_mm:.3f}", TRE_SD: f"{tre.sd_mm:.3f}", TRE_MAX: f"{tre.max_mm:.3f}"})
+        rows.update({names.TRE_MEAN: f"{tre.mean_mm:.3f}", names.TRE_SD: f"{tre.sd_mm:.3f}", names.TRE_MAX: f"{tre.max_mm:.3f}"})
     if distances is not None:
-        rows.update({PLAUSIBILITY_MEAN: f"{distances.mean_mm:.3f}", PLAUSIBILITY_MAX: f"{distances.max_mm:.3f}"})
+        rows.update({names.PLAUSIBILITY_MEAN: f"{distances.mean_mm:.3f}", names.PLAUSIBILITY_MAX: f"{distances.max_mm:.3f}"})
         touched = confidence.touched
-        rows[TOUCHED] = NOT_STATED if touched is None else f"{touched.outcome}; {touched.expectation}"
+        rows[names.TOUCHED] = NOT_STATED if touched is None else f"{touched.outcome}; {touched.expectation}"
     if confidence.below_limit is not None:
-        rows[BELOW_LIMIT] = f"{probability(confidence.below_limit)} for {confidence.limit_mm:g} mm"
+        rows[names.BELOW_LIMIT] = f"{probability(confidence.below_limit)} for {confidence.limit_mm:g} mm"
     if confidence.held_out is not None:
-        rows[HELD_OUT] = f"{confidence.held_out.outcome}; {confidence.held_out.expectation}"
+        rows[names.HELD_OUT] = f"{confidence.held_out.outcome}; {confidence.held_out.expectation}"
     if confidence.left_out is not None:
-        rows[INFLUENTIAL] = confidence.left_out.influence
+        rows[names.INFLUENTIAL] = confidence.left_out.influence
     return rows
-
-
-def contradicts(said: str) -> bool:
-    """Whether a row about points and what was expected of them says that the stated error is too small."""
-    return TOO_SMALL in said
 
 
 def residual_columns(points: BonePoints, result: RegistrationResult) -> dict[str, list[object]]:

@@ -14,7 +14,7 @@ from CranioNavLib.case import read_case
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import read_recording
 from CranioNavLib.slicer_files import LabelledPoints, load_scene, read_points, read_transform, write_points
-from ModuleRegistrationLib import result_tables
+from ModuleRegistrationLib import quantities
 from ModuleRegistrationLib.procedure import register_case
 
 from Workstation.__main__ import run
@@ -70,7 +70,7 @@ def test_a_registered_case_leaves_record_transform_scene_and_report(a_case, tmp_
     np.testing.assert_allclose(scene_data.get_transform("ReferenceToRas"), matrix, atol=1e-9)
     np.testing.assert_allclose(scene_data.get_motion_error()[0], record["verification"]["covariance"])
     rows = dict(zip(*scene_data.get_table("Results").values()))
-    assert "expected (p = " in rows[result_tables.HELD_OUT]
+    assert "expected (p = " in rows[quantities.HELD_OUT]
     assert len(scene_data.get_bone_points()) >= 12
     node = host.scene().GetFirstNodeByName("SurfacePoints")
     assert node.GetParentTransformNode().GetName() == "ReferenceToRas"

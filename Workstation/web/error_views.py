@@ -134,7 +134,7 @@ def residual_glyphs(positions_mm: Array, residuals_mm: Array, used: Array) -> An
 
 def _landmarks_alone() -> bool:
     """Whether the registration in force is the landmarks', and no surface registration has judged the points yet."""
-    from ModuleRegistrationLib.result_tables import QUANTITY, STATUS
+    from ModuleRegistrationLib.quantities import QUANTITY, STATUS
 
     if scene.find_or_create("ReferenceToRas").GetAttribute(scene.STATUS_ATTRIBUTE) != "landmarks":
         return False

@@ -83,8 +83,7 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         def read(progress: Progress) -> Any:
             from ModuleRegistrationLib.anatomy.ct_reader import read_ct
             from ModuleRegistrationLib.anatomy.segmentation import segment_bone
-
-            from ModuleRegistration import prepared
+            from ModuleRegistrationLib.logic.bone import prepared
 
             progress("reading the CT", 0.1)
             volume = read_ct(folder / "ct.nrrd")
@@ -113,7 +112,7 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         self.session.folder = folder
         registration.takeCt(volume)
         if bone is not None:
-            registration._takeBone(bone)
+            registration.takeBone(bone)
         for role, points in lists.items():
             scene_data.set_points(role, points)
         if patient is not None:

@@ -13,7 +13,9 @@ from CranioNavLib.rigid import invert_rigid, rigid_from_vector, transform_points
 from CranioNavLib.slicer_files import LabelledPoints, load_scene, read_transform, save_scene
 from CranioNavLib.surface import Surface
 from CranioNavLib.volume import Volume
-from ModuleRegistrationLib import result_tables as names
+from ModuleRegistrationLib import quantities as names
+from ModuleRegistrationLib.logic import results
+from ModuleRegistrationLib.logic.planning import off_the_head
 from ModuleRegistrationLib.panel_description import PANEL
 from ModuleRegistrationLib.registration import verdict as verdicts
 
@@ -88,7 +90,7 @@ def test_landmarks_then_surface_then_verification(a_patient):
     errors = scene_data.get_table("TargetErrors")
     assert errors["target"] == ["t1", "t2", "t3"], "paired by label"
     assert max(errors["TRE (mm)"]) == pytest.approx(worst_target_error(), abs=1e-6)
-    rows = a_patient._rows()
+    rows = results.rows()
     assert float(rows[names.TRE_MAX]) == pytest.approx(max(errors["TRE (mm)"]), abs=1e-3)
     assert float(rows[names.PLAUSIBILITY_MAX]) < 0.5
     assert len(scene_data.get_table("Residuals")["point"]) == 40
@@ -122,7 +124,7 @@ def test_a_refused_surface_registration_leaves_the_landmarks_and_says_so(a_patie
     with pytest.raises(InputError, match="palpate the left side"):
         a_patient.registerSurface().run()
     np.testing.assert_allclose(scene_data.get_transform("ReferenceToRas"), landmarks, atol=1e-12)
-    assert a_patient._status() == "landmarks"
+    assert results.status() == "landmarks"
     assert a_patient.verdict().level is Level.BAD
     assert a_patient.surfaceStatus().state is StepState.ATTENTION
     assert scene.find("RegisteredPoints") is None
@@ -210,7 +212,7 @@ def a_ball_in_air(a_logic):
     [((5, -10, 20), False), ((5, 49, 20), False), ((5, 53, 20), False), ((5, 60, 20), True), ((5, 500, 20), True)],
 )
 def test_a_landmark_lies_on_the_head_or_in_it(a_ball_in_air, place, refused):
-    assert ("missed the head" in a_ball_in_air._offTheHead(place)) == refused
+    assert ("missed the head" in off_the_head(place)) == refused
 
 
 def test_landmarks_are_planned_without_a_mouse_and_each_step_is_taken_back(a_ball_in_air, monkeypatch):
@@ -250,7 +252,7 @@ def test_unpaired_landmarks_are_refused_and_nothing_is_written(a_patient):
     scene_data.set_points("LandmarksPatient", LabelledPoints(points.labels[:3], points.positions_mm[:3]))
     with pytest.raises(InputError, match=r"3 patient and 4 CT"):
         a_patient.registerLandmarks()
-    assert a_patient._status() == ""
+    assert results.status() == ""
     assert scene.find("Results") is None
 
 

@@ -1,0 +1,83 @@
+"""What the scene holds for a registration: which nodes are filled, points by pairs, the bone and what is promised of it."""
+
+from __future__ import annotations
+
+from typing import Any, Optional
+
+from CranioNavLib import scene, scene_data
+from CranioNavLib.errors import InputError
+from CranioNavLib.module_logic import ParametersInScene
+from CranioNavLib.rigid import Array
+
+from ModuleRegistrationLib.panel_description import RegistrationParameters
+
+# on OuterTable: what its segmentation promises
+POSITION_SD, OFFSET_SD, THRESHOLD = "CranioNav.PositionSdMm", "CranioNav.OffsetSdMm", "CranioNav.ThresholdHu"
+
+
+class RegistrationStep(ParametersInScene[RegistrationParameters]):
+    """What every step of the panel stands on."""
+
+    parameterClass = RegistrationParameters
+    sessionRole = "RegistrationSession"
+
+
+def lacking(*roles: str) -> str:
+    """Which of these nodes are missing or empty, in words; "" if none."""
+    empty = [role for role in roles if not _has_content(scene.find(role))]
+    return f"{', '.join(empty)} still missing" if empty else ""
+
+
+def lacking_ct() -> str:
+    """What to do before anything can be done with the CT; "" if it is there."""
+    return "" if scene.find("CT") is not None else "load a CT first"
+
+
+def pairs(patient_role: str, ct_role: str) -> tuple[Array, Array, tuple[str, ...]]:
+    """Points (N, 3) in Reference and in RAS with the same labels, and these.
+
+    Raises
+    ------
+    InputError
+        The lists do not pair.
+    """
+    from ModuleRegistrationLib.registration.pairing import pair_points
+
+    patient, planned = scene_data.get_points(patient_role), scene_data.get_points(ct_role)
+    return pair_points(patient.labels, patient.positions_mm, planned.labels, planned.positions_mm)
+
+
+def promised() -> dict[str, Any]:
+    """What the segmentation promises of the outer table, as far as it is known."""
+    table = scene.find("OuterTable")
+    texts: list[Optional[str]] = [table.GetAttribute(name) for name in (POSITION_SD, OFFSET_SD)] if table is not None else []
+    known = [float(text) for text in texts if text]
+    return dict(zip(("surface_sd_mm", "surface_offset_sd_mm"), known)) if len(known) == 2 else {}
+
+
+def targets() -> Array:
+    """Where the error matters (T, 3): the targets of the CT, or places all over the outer table, or the landmarks.
+
+    Raises
+    ------
+    InputError
+        There is none of these.
+    """
+    from ModuleRegistrationLib.procedure import DEFAULT_TARGETS, spread_over
+
+    for role in ("TargetsCT", "OuterTable", "LandmarksCT"):
+        if not lacking(role) and role == "OuterTable":
+            return spread_over(scene_data.get_surface(role).vertices_mm, DEFAULT_TARGETS)
+        if not lacking(role):
+            return scene_data.get_points(role).positions_mm
+    raise InputError("there are no targets in the CT to tell an error at; load or find them, or find the bone")
+
+
+def _has_content(node: Any) -> bool:
+    if node is None:
+        return False
+    if node.IsA("vtkMRMLMarkupsNode"):
+        return bool(node.GetNumberOfControlPoints() > 0)
+    if node.IsA("vtkMRMLModelNode"):
+        return node.GetPolyData() is not None and bool(node.GetPolyData().GetNumberOfPoints() > 0)
+    return True

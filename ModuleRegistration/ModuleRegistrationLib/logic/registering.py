@@ -1,0 +1,171 @@
+"""The landmark and surface steps: ReferenceToRas, first from pairs, then from bone points laid on the outer table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Optional
+
+from CranioNavLib import scene, scene_data
+from CranioNavLib.errors import InputError
+from CranioNavLib.module_logic import done_or, todo
+from CranioNavLib.panel import Level, Progress, Reading, StepState, StepStatus, Task
+from CranioNavLib.rigid import Array
+from CranioNavLib.slicer_files import LabelledPoints
+
+from ModuleRegistrationLib import quantities as names
+from ModuleRegistrationLib.logic import results
+from ModuleRegistrationLib.logic.given import RegistrationStep, lacking, pairs, promised, targets
+
+if TYPE_CHECKING:
+    from ModuleRegistrationLib.registration.error_theory import PredictedTre
+    from ModuleRegistrationLib.registration.landmarks import LandmarkRegistration
+    from ModuleRegistrationLib.registration.problem import RegistrationProblem, RegistrationResult, SurfaceRegistration
+    from ModuleRegistrationLib.registration.verdict import Verdict
+
+    Judged = tuple[RegistrationResult, Verdict, Optional[PredictedTre]]
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceRegistered:
+    """What a surface registration was made of and came to, kept for what asks about it later."""
+
+    problem: RegistrationProblem
+    method: SurfaceRegistration
+    result: RegistrationResult
+    verdict: Verdict
+
+
+class RegisteringSteps(RegistrationStep):
+    """Landmarks, surface, and what the panel says of them."""
+
+    def __init__(self, parent: Any = None) -> None:
+        super().__init__(parent)
+        self.registered: Optional[SurfaceRegistered] = None  # last surface registration
+
+    # Landmarks
+
+    def registerLandmarks(self) -> str:
+        """Register the landmark pairs; writes ReferenceToRas and Results. Returns a message."""
+        from ModuleRegistrationLib.result_tables import landmark_rows
+
+        found = self._landmarks()
+        self.registered = None
+        results.set_registration(found.reference_to_ras, "landmarks", landmark_rows(found), found)
+        return "; ".join([f"{len(found.labels)} landmark pairs, FRE {found.fre_mm:.2f} mm (RMS)", *found.warnings])
+
+    def registerLandmarksBlocked(self) -> str:
+        """Why landmarks cannot be registered now."""
+        return lacking("LandmarksCT", "LandmarksPatient")
+
+    def _landmarks(self) -> LandmarkRegistration:
+        from ModuleRegistrationLib.registration.landmarks import register_landmarks
+
+        patient, planned, labels = pairs("LandmarksPatient", "LandmarksCT")
+        return register_landmarks(patient, planned, labels, expected_fle_mm=self.parameters().read().landmark_fle_mm)
+
+    def fre(self) -> Optional[Reading]:
+        """FRE of the landmarks."""
+        return results.reading(names.FRE, level=Level.PLAIN)  # a low FRE is no sign of a low TRE
+
+    def landmarkStatus(self) -> StepStatus:
+        """Whether landmarks are registered."""
+        return done_or(bool(results.status()), self.registerLandmarksBlocked() or "register the landmarks")
+
+    # Surface
+
+    def registerSurface(self) -> Task:
+        """Lay the bone points on the outer table; writes ReferenceToRas unless refused, Results, Residuals, plot."""
+        from ModuleRegistrationLib.registration.error_theory import predict_tre_of
+        from ModuleRegistrationLib.registration.verdict import judge
+
+        landmarks, problem, places = self._problem()
+        method = self.createPlugin("registration", self.parameters().read().method)
+
+        def register(progress: Progress) -> Judged:
+            progress(f"registering with {method.name}", 0.1)
+            result = method.register(problem)
+            progress("judging the result", 0.8)
+            predicted = predict_tre_of(result, places) if result.covariance is not None else None
+            return result, judge(problem, result, places), predicted
+
+        return Task("Register surface", register, lambda done: self._takeSurface(landmarks, problem, method, *done))
+
+    def registerSurfaceBlocked(self) -> str:
+        """Why the surface cannot be registered now."""
+        return lacking("OuterTable", "LandmarksCT", "LandmarksPatient", "SurfacePoints")
+
+    def _problem(self) -> tuple[LandmarkRegistration, RegistrationProblem, Array]:
+        from ModuleRegistrationLib.registration.problem import RegistrationProblem
+
+        wanted, landmarks = self.parameters().read(), self._landmarks()
+        patient, planned, _ = pairs("LandmarksPatient", "LandmarksCT")
+        problem = RegistrationProblem(
+            surface=scene_data.get_surface("OuterTable"),
+            points=scene_data.get_bone_points("SurfacePoints", wanted.palpated_sd_mm),
+            initial_reference_to_ras=landmarks.reference_to_ras,
+            landmarks_ct_mm=planned,
+            landmarks_patient_mm=patient,
+            **promised(),
+        )
+        return landmarks, problem, targets()
+
+    def _takeSurface(
+        self,
+        landmarks: LandmarkRegistration,
+        problem: RegistrationProblem,
+        method: SurfaceRegistration,
+        result: RegistrationResult,
+        verdict: Verdict,
+        predicted: Optional[PredictedTre],
+    ) -> str:
+        from ModuleRegistrationLib.result_tables import landmark_rows, residual_columns, surface_rows
+
+        points, rows = problem.points, {**landmark_rows(landmarks), **surface_rows(result, verdict, predicted)}
+        refused = verdict.status == "refused"  # then the landmarks' registration stays, and is shown as no more than that
+        matrix, status = (landmarks.reference_to_ras, "landmarks") if refused else (result.reference_to_ras, verdict.status)
+        results.set_registration(matrix, status, rows, landmarks if refused else result)
+        self.registered = SurfaceRegistered(problem, method, result, verdict)
+        scene_data.set_table("Residuals", residual_columns(points, result))
+        _plot_residuals()
+        if refused:
+            raise InputError("; ".join(verdict.messages) or "the registration is refused")
+        scene_data.set_points("RegisteredPoints", LabelledPoints(points.labels, result.points_ras_mm))
+        return "; ".join([f"{verdict.status} after {result.iterations} iterations ({result.stop_reason})", *verdict.messages])
+
+    def surfaceResidual(self) -> Optional[Reading]:
+        """RMS distance of the bone points to the surface."""
+        return results.reading(names.SURFACE_RMS, level=Level.PLAIN)  # a low residual is no sign of a low TRE
+
+    def speedOfSound(self) -> Optional[Reading]:
+        """Estimated speed of sound in the scalp."""
+        return results.reading(names.SPEED)
+
+    def predictedTre(self) -> Optional[Reading]:
+        """Predicted TRE, mean over the targets, and the 95% bound at the worst one."""
+        return results.reading(names.PREDICTED_MEAN, "; ", names.PREDICTED_P95)
+
+    def verdict(self) -> Optional[Reading]:
+        """Accepted, warning or refused; None before there is a surface registration."""
+        status = results.rows().get(names.STATUS, "")
+        return Reading(status, results.LEVELS[status]) if status else None
+
+    def surfaceStatus(self) -> StepStatus:
+        """Whether the surface registration holds, or what its verdict asks for."""
+        rows = results.rows()
+        status = rows.get(names.STATUS, "")
+        if not status:
+            return todo(self.registerSurfaceBlocked() or "register the surface")
+        return StepStatus(StepState.DONE if status == "accepted" else StepState.ATTENTION, rows.get(names.MESSAGE, ""))
+
+
+def _plot_residuals() -> None:
+    series, chart = scene.find_or_create("ResidualsSeries"), scene.find_or_create("ResidualsChart")
+    series.SetAndObserveTableNodeID(scene.find_or_create("Residuals").GetID())
+    series.SetPlotType(series.PlotTypeBar)
+    series.SetLabelColumnName("point")
+    series.SetYColumnName("residual (mm)")
+    chart.SetTitle("Distance of each bone point to the surface")
+    chart.SetYAxisTitle("residual (mm)")
+    chart.SetXAxisTitle("bone point")
+    if not chart.HasPlotSeriesNodeID(series.GetID()):
+        chart.AddAndObservePlotSeriesNodeID(series.GetID())

@@ -1,0 +1,129 @@
+"""The last two steps: the registration compared with what it has not used, and the results as files."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Optional
+
+from CranioNavLib import scene_data
+from CranioNavLib.files import output_folder
+from CranioNavLib.module_logic import done_or
+from CranioNavLib.panel import Progress, Reading, StepState, StepStatus, Task
+from CranioNavLib.slicer_files import save_scene, write_transform
+
+from ModuleRegistrationLib import quantities as names
+from ModuleRegistrationLib.logic import results
+from ModuleRegistrationLib.logic.given import lacking, pairs, promised, targets
+from ModuleRegistrationLib.logic.registering import RegisteringSteps
+
+if TYPE_CHECKING:
+    from ModuleRegistrationLib.registration.problem import RegistrationProblem, RegistrationResult, SurfaceRegistration
+    from ModuleRegistrationLib.verification.checks import Checks, ToVerify
+
+    OnSurface = tuple[RegistrationProblem, RegistrationResult, SurfaceRegistration]
+
+MARKERS, TOUCHED = ("TargetsCT", "TargetsPatient"), ("PlausibilityPoints", "Bone")  # what there may be to verify with
+
+
+class VerifyingSteps(RegisteringSteps):
+    """Verification of the registration in the scene, and saving it."""
+
+    def verify(self) -> Task:
+        """Measured TRE, distance of the plausibility points, and whether the stated error is right; into Results."""
+        from ModuleRegistrationLib.result_tables import verification_rows
+        from ModuleRegistrationLib.verification.checks import verify
+
+        given, labels = self._toVerify()
+
+        def check(progress: Progress) -> Checks:
+            progress("comparing with what the registration has not used", 0.1)
+            return verify(given)
+
+        def take(checks: Checks) -> str:
+            errors, distances = checks.errors, checks.distances
+            if errors:
+                scene_data.set_table("TargetErrors", {"target": list(labels), "TRE (mm)": errors.errors_mm.tolist()})
+            results.write_rows({**results.rows(), **verification_rows(checks)})
+            said = [f"TRE {errors.mean_mm:.2f} mm (mean), {errors.max_mm:.2f} mm (largest)"] if errors else []
+            said += [f"plausibility {distances.max_mm:.2f} mm (largest)"] if distances else []
+            return "; ".join([*said, *checks.confidence.sentences()])
+
+        return Task("Verify", check, take)
+
+    def _toVerify(self) -> tuple[ToVerify, tuple[str, ...]]:
+        """What there is to verify with, and the labels of the markers among it."""
+        from ModuleRegistrationLib.verification.checks import StatedError, ToVerify
+
+        error, wanted = scene_data.get_motion_error(), self.parameters().read()
+        labels: tuple[str, ...] = ()
+        given: dict[str, Any] = {
+            "reference_to_ras": scene_data.get_transform("ReferenceToRas"),
+            "targets_ras_mm": targets(),
+            "limit_mm": wanted.tre_limit_mm,
+            "touched_sd_mm": wanted.palpated_sd_mm,
+            "stated": StatedError(*error, **promised()) if error else None,
+            "surface": self._verifiable(),
+        }
+        if not lacking(*MARKERS):
+            *given["markers"], labels = pairs("TargetsPatient", "TargetsCT")
+        if not lacking(*TOUCHED):
+            given["touched"], given["bone"] = scene_data.get_points("PlausibilityPoints"), scene_data.get_surface("Bone")
+        return ToVerify(**given), labels
+
+    def _verifiable(self) -> Optional[OnSurface]:
+        """Problem, result and method of a surface registration that stands; None after landmarks alone or a refusal."""
+        if self.registered is None or self.registered.verdict.status == "refused":
+            return None
+        return self.registered.problem, self.registered.result, self.registered.method
+
+    def verifyBlocked(self) -> str:
+        """Why nothing can be verified now."""
+        if not results.status():
+            return "register first"
+        missing = lacking(*MARKERS), lacking(*TOUCHED)
+        return "" if "" in missing or self._verifiable() else missing[0]
+
+    def measuredTre(self) -> Optional[Reading]:
+        """Measured TRE."""
+        return results.reading(names.TRE_MEAN, " ± ", names.TRE_SD, "; ", names.TRE_MAX)
+
+    def plausibility(self) -> Optional[Reading]:
+        """Largest distance of a plausibility point."""
+        return results.reading(names.PLAUSIBILITY_MAX)
+
+    def belowLimit(self) -> Optional[Reading]:
+        """Probability that the TRE is below the limit, at the worst target."""
+        return results.said(names.BELOW_LIMIT)
+
+    def touchedPoints(self) -> Optional[Reading]:
+        """Plausibility points beside what was to be expected of them."""
+        return results.said(names.TOUCHED)
+
+    def heldOutPoints(self) -> Optional[Reading]:
+        """Points left out of the registration beside what was to be expected of them."""
+        return results.said(names.HELD_OUT)
+
+    def influentialPoint(self) -> Optional[Reading]:
+        """The point without which the targets would move most."""
+        return results.said(names.INFLUENTIAL)
+
+    def verificationStatus(self) -> StepStatus:
+        """Whether the registration is verified, or what speaks against its stated error."""
+        rows = results.rows()
+        doubts = [f"{name}: {rows[name]}" for name in (names.TOUCHED, names.HELD_OUT) if results.contradicts(rows.get(name, ""))]
+        if doubts:
+            return StepStatus(StepState.ATTENTION, "; ".join(doubts))
+        verified = any(name in rows for name in (names.TRE_MEAN, names.PLAUSIBILITY_MAX, names.HELD_OUT, names.BELOW_LIMIT))
+        return done_or(verified, self.verifyBlocked() or "verify the registration")
+
+    def saveResults(self) -> str:
+        """Write ReferenceToRas.tfm and scene.mrb into `output_folder`. Returns a message."""
+        folder = output_folder(self.parameters().read().output_folder)
+        write_transform(folder / "ReferenceToRas.tfm", scene_data.get_transform("ReferenceToRas"))
+        save_scene(folder / "scene.mrb")
+        return f"ReferenceToRas.tfm and scene.mrb are in {folder}"
+
+    def saveResultsBlocked(self) -> str:
+        """Why nothing can be saved now."""
+        if not results.status():
+            return "register first"
+        return "" if self.parameters().read().output_folder else "choose a folder first"
