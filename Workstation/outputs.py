@@ -20,10 +20,11 @@ def write_outputs(
     result: CaseResult,
     folder: Path,
     scene: bool = True,
+    pdf: bool = True,
     notes: Mapping[str, str] | None = None,
     progress: Optional[Callable[[str, float], None]] = None,
 ) -> dict[str, Any]:
-    """Write transform, registration.json, scene.mrb (if asked) and report.html; return the registration record."""
+    """Write transform, registration.json, report.html and, if asked, scene.mrb and report.pdf; return the registration record."""
     from ModuleRegistrationLib.verification.report import write_report
 
     say = progress or (lambda step, share: None)
@@ -38,7 +39,14 @@ def write_outputs(
         save_scene(folder / "scene.mrb")
     else:
         (folder / "scene.mrb").unlink(missing_ok=True)  # an earlier call's is not this one's
-    write_report(result, folder / "report.html", versions(), notes, progress=lambda step, share: say(step, 0.4 + 0.6 * share))
+    write_report(result, folder / "report.html", versions(), notes, progress=lambda step, share: say(step, 0.4 + 0.5 * share))
+    if pdf:
+        from Workstation.report_pdf import write_report_pdf
+
+        say("printing the report", 0.9)
+        write_report_pdf(folder / "report.html", folder / "report.pdf")
+    else:
+        (folder / "report.pdf").unlink(missing_ok=True)
     return record
 
 
@@ -55,7 +63,7 @@ def write_failure(case: Path, folder: Path, status: str, message: str) -> dict[s
         versions=versions(),
     )
     if folder.is_dir():
-        for left_over in ("ReferenceToRas.tfm", "report.html", "scene.mrb"):  # an earlier call's result is not this one's
+        for left_over in ("ReferenceToRas.tfm", "report.html", "report.pdf", "scene.mrb"):  # an earlier call's result is not this one's
             (folder / left_over).unlink(missing_ok=True)
         write_text(folder / "registration.json", json.dumps(record, indent=2) + "\n")
     return record

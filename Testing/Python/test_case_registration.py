@@ -16,6 +16,7 @@ from CranioNavLib.sequence_metafile import read_recording
 from CranioNavLib.slicer_files import LabelledPoints, load_scene, read_points, read_transform, write_points
 from ModuleRegistrationLib import quantities
 from ModuleRegistrationLib.procedure import register_case
+from pypdf import PdfReader
 
 from Workstation.__main__ import run
 from Workstation.results import registration_record, write_registration
@@ -78,6 +79,12 @@ def test_a_registered_case_leaves_record_transform_scene_and_report(a_case, tmp_
     assert page.count("data:image/png;base64,") == 5
     assert re.findall(r'(?:src|href)="(?!data:)', page) == []
     assert "not a medical device" in page
+    pages = [sheet.extract_text() for sheet in PdfReader(tmp_path / "out" / "report.pdf").pages]
+    assert f"{record['tre_mean_mm']:.2f} ±" in pages[0]
+    assert "not a medical device" in pages[-1]
+    for number, text in enumerate(pages, 1):  # each sheet says whose it is: it may be read alone
+        assert f"{number} / {len(pages)}" in text
+        assert f"Case {record['case']} · mode III" in text
 
 
 def test_the_error_of_a_transform_is_the_same_when_evaluated_alone(a_case, tmp_path, capsys):
@@ -103,6 +110,7 @@ def test_a_batch_goes_on_past_a_case_that_fails(a_case, tmp_path, capsys):
     assert float(rows[1]["tre_mean_mm"]) > 0
     assert set(json.loads((out / "broken" / "registration.json").read_text())) == KEYS
     assert not (out / "case" / "scene.mrb").exists()
+    assert not (out / "case" / "report.pdf").exists()
 
 
 def test_renamed_landmarks_pair_by_order_and_shuffled_ones_by_label(a_case):
@@ -158,7 +166,7 @@ def test_bad_landmarks_are_refused_by_name(a_case, capsys, change, message):
     assert message in refusal(capsys, a_case, "--mode", "IIa")
 
 
-RESULT_FILES = ("ReferenceToRas.tfm", "scene.mrb", "report.html")
+RESULT_FILES = ("ReferenceToRas.tfm", "scene.mrb", "report.html", "report.pdf")
 
 
 @pytest.mark.parametrize("why", ["landmarks in metres", "no such mode", "no such method", "no such case", "no plugin file"])

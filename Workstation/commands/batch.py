@@ -15,6 +15,7 @@ def batch(
     mode: Annotated[Optional[str], typer.Option(help="Ia, Ib, IIa, IIb or III; default: the richest each case allows")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="cases at the same time")] = 1,
     scenes: Annotated[bool, typer.Option("--scenes", help="write scene.mrb for each case too")] = False,
+    pdf: Annotated[bool, typer.Option("--pdf", help="write report.pdf for each case too")] = False,
     json: Annotated[bool, typer.Option("--json", help="print the summary as JSON")] = False,
 ) -> int:
     """Register many cases; one folder a case and DIR/summary.csv. A case that fails does not stop the others.
@@ -38,7 +39,7 @@ def batch(
     folder = output_folder(output)
     records: list[dict[str, Any]] = []
     with progress_bar() as say:
-        work = (delayed(register_one)(case, folder / name, method, mode, scenes) for case, name in zip(cases, names))
+        work = (delayed(register_one)(case, folder / name, method, mode, scenes, pdf) for case, name in zip(cases, names))
         for record in Parallel(n_jobs=jobs, return_as="generator")(work):
             records.append(record)
             say(f"{record['case']}: {record['status']}", len(records) / len(cases))
@@ -49,7 +50,9 @@ def batch(
     return 2 if all(record["status"] == "refused" for record in records) else 0
 
 
-def register_one(case: Path, folder: Path, method: Optional[str], mode: Optional[str], scenes: bool) -> dict[str, Any]:
+def register_one(
+    case: Path, folder: Path, method: Optional[str], mode: Optional[str], scenes: bool = False, pdf: bool = False
+) -> dict[str, Any]:
     """The record of one case; one that cannot be registered gives a record that says why."""
     from CranioNavLib.case import read_case
     from CranioNavLib.errors import InputError
@@ -60,7 +63,7 @@ def register_one(case: Path, folder: Path, method: Optional[str], mode: Optional
 
     try:
         output_folder(folder)
-        return write_outputs(register_case(read_case(case), mode, method), folder, scene=scenes)
+        return write_outputs(register_case(read_case(case), mode, method), folder, scene=scenes, pdf=pdf)
     except InputError as error:
         return write_failure(case, folder, "refused", str(error))
     except Exception as error:  # a defect in one case must not cost the others

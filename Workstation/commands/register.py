@@ -19,7 +19,7 @@ def register(
     load: Annotated[Optional[list[Path]], typer.Option(metavar="FILE", help="a Python file that registers plugins")] = None,
     json: Annotated[bool, typer.Option("--json", help="print registration.json on stdout")] = False,
 ) -> int:
-    """Register a case; write the transform, registration.json, scene.mrb and report.html.
+    """Register a case; write the transform, registration.json, scene.mrb, report.html and report.pdf.
 
     A registration that is refused ends with exit status 2 and leaves no transform file, not even an
     earlier one's.

@@ -20,7 +20,7 @@ from CranioNavLib.scripted_module import ScriptedLoadableModuleLogic
 
 from Workstation.web.session_folder import SessionFolder, last_session
 
-OFFERED = ("report.html", "scene.mrb", "ReferenceToRas.tfm", "registration.json")  # what the page lets one open
+OFFERED = ("report.html", "report.pdf", "scene.mrb", "ReferenceToRas.tfm", "registration.json")  # what the page lets one open
 USUAL_REPORT_S = 15.0  # the bar stands at half then
 SAME_MM = 0.05  # between the registration on the screen and the one that the report repeats from the files
 
