@@ -63,7 +63,8 @@ def write_failure(case: Path, folder: Path, status: str, message: str) -> dict[s
         versions=versions(),
     )
     if folder.is_dir():
-        for left_over in ("ReferenceToRas.tfm", "report.html", "report.pdf", "scene.mrb"):  # an earlier call's result is not this one's
+        # an earlier call's result is not this one's
+        for left_over in ("ReferenceToRas.tfm", "report.html", "report.pdf", "scene.mrb"):
             (folder / left_over).unlink(missing_ok=True)
         write_text(folder / "registration.json", json.dumps(record, indent=2) + "\n")
     return record
