@@ -2,8 +2,9 @@
 
     python Testing/Benchmarks/workstation.py [start] [ct] [latency] [memory] [--minutes 10] [--runs 5]
 
-Each picture that the server sends carries the time at which its newest pose was taken (8 bytes behind the JPEG, which
-decoders leave alone), and the page notes when it is on the screen. Server and browser share one computer and its clock.
+Each picture that the server sends carries the time at which the pose that it shows was taken (8 bytes behind the JPEG, which
+decoders leave alone), and the page notes when the frame is done in which it was drawn. Server and browser share one computer
+and its clock.
 Needs Chromium and the sample head. Everything tracked here is simulated.
 """
 
@@ -29,25 +30,30 @@ USER = ROOT / "Testing" / "Python" / "workstation_user.py"
 STALL_S = 0.05  # shorter waits of the event loop are not looked at
 WATCH_PICTURES = """
 (() => {
-  const make = URL.createObjectURL.bind(URL), stamps = new Map();
+  const stamps = new Map(), utf8 = new TextDecoder();
   window.seenPictures = [];
-  URL.createObjectURL = (blob) => {
-    const url = make(blob);
-    if (blob.type === 'image/jpeg') {
-      stamps.set(url, blob.slice(-8).arrayBuffer().then((bytes) => new DataView(bytes).getFloat64(0, true)));
-      if (stamps.size > 400) stamps.delete(stamps.keys().next().value);
+  window.WebSocket = class extends window.WebSocket {
+    constructor(address, ...rest) {
+      super(address, ...rest);
+      this.pictures = String(address).endsWith('/pictures');
+      if (this.pictures) this.addEventListener('message', ({ data }) => {
+        if (typeof data === 'string') return;
+        const view = new DataView(data), area = utf8.decode(new Uint8Array(data, 5, view.getUint8(4)));
+        stamps.set(JSON.stringify([area, view.getUint32(0, true)]), view.getFloat64(data.byteLength - 8, true));
+        if (stamps.size > 400) stamps.delete(stamps.keys().next().value);
+      });
     }
-    return url;
+    send(message) {
+      super.send(message);
+      if (!this.pictures) return;
+      const [area] = JSON.parse(message), canvases = [...document.querySelectorAll('canvas[data-picture]')];
+      const view = canvases.findIndex((one) => one.dataset.picture === area), { width, height } = canvases[view];
+      requestAnimationFrame(() => {  // it was drawn within a frame: when the next one begins, that one is done
+        const shown = (performance.timeOrigin + performance.now()) / 1000;
+        window.seenPictures.push([view, stamps.get(message), shown, width * height]);
+      });
+    }
   };
-  document.addEventListener('load', (event) => {
-    const image = event.target, known = image.tagName === 'IMG' && stamps.get(image.src);
-    if (!known || !image.classList.contains('image-display-area')) return;
-    const view = [...document.querySelectorAll('.image-display-area')].indexOf(image), width = image.naturalWidth;
-    requestAnimationFrame(async () => {
-      const shown = performance.timeOrigin + performance.now();
-      window.seenPictures.push([view, await known, shown / 1000, width * image.naturalHeight]);
-    });
-  }, true);
 })();
 """
 
@@ -64,22 +70,27 @@ def user_module() -> Any:
 
 def run_stamped_server(arguments: list[str]) -> None:
     """`cranionav workstation` whose pictures carry the time of their newest pose; the loop's stalls go to stderr."""
-    from trame_rca.schedulers.image_scheduler import RcaImageRenderScheduler
-
     from Workstation.__main__ import main
+    from Workstation.web.application import WorkstationApp
+    from Workstation.web.pictures import Pictures
 
-    render = RcaImageRenderScheduler._render_frame
+    lead, begun, offer = WorkstationApp._lead, Pictures.begun, Pictures.offer
+    taken_s = [0.0]  # by the newest pose when the round began: the slices were put where that one is
 
-    async def stamped(picture: Any, taken_s: float) -> Any:
-        content, meta, made = await picture
-        return content + struct.pack("<d", taken_s), meta, made
+    def lead_noted(self: Any) -> None:
+        lead(self)
+        taken_s[0] = newest_pose_s()
 
-    def render_stamped(self: Any, quality: int) -> None:
-        render(self, quality)
-        waiting = self._push_queue._queue
-        waiting[-1] = stamped(waiting[-1], newest_pose_s())
+    def begun_noted(self: Any, area: str) -> Any:
+        picture = begun(self, area)
+        picture.taken_s = taken_s[0]  # type: ignore[attr-defined]
+        return picture
 
-    RcaImageRenderScheduler._render_frame = render_stamped
+    def offer_stamped(self: Any, picture: Any) -> None:
+        picture.content += struct.pack("<d", picture.taken_s)
+        offer(self, picture)
+
+    WorkstationApp._lead, Pictures.begun, Pictures.offer = lead_noted, begun_noted, offer_stamped  # type: ignore[method-assign]
     watch_loop()
     sys.argv = ["cranionav", "workstation", *arguments]
     main()

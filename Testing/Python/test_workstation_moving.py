@@ -13,6 +13,7 @@ from vtkmodules.vtkRenderingCore import vtkActor, vtkPolyDataMapper, vtkRenderer
 
 from Workstation.web.moving import MovingPicture
 from Workstation.web.pacing import PacedRendering, Painter
+from Workstation.web.pictures import HEADER, MOST_ON_THEIR_WAY, Pictures, Viewer
 
 
 def actor_of(mesh: Any, color: tuple[float, float, float]) -> Any:
@@ -95,14 +96,14 @@ def drawn_anew(tool: Tool) -> Any:
     view.renderer().AddActor(actor_of(tool.mesh, (0.9, 0.6, 0.0)))
     view.renderer().SetActiveCamera(camera)
     view.renderer().ResetCameraClippingRange()
-    return MovingPicture(view, list).img_cols_rows[0].astype(int)
+    return MovingPicture(view, list).draw().astype(int)
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0, 80.0), (55.0, 10.0, 0.0), (0.0, 0.0, -80.0), (40.0, 40.0, 40.0)])
 def test_a_tool_before_in_and_behind_the_skull_looks_as_if_drawn_with_it(place):
     tool, view = Tool(*place), View()
-    picture, height, width = MovingPicture(view, lambda: [tool]).img_cols_rows
-    assert (height, width) == (160, 200)
+    picture = MovingPicture(view, lambda: [tool]).draw()
+    assert picture.shape == (160, 200, 3)
     differs = np.abs(picture.astype(int) - drawn_anew(tool)).max(axis=2) > 40
     assert differs.mean() < 0.005
 
@@ -110,46 +111,70 @@ def test_a_tool_before_in_and_behind_the_skull_looks_as_if_drawn_with_it(place):
 def test_a_tool_that_moves_leaves_the_rest_undrawn():
     tool, view = Tool(0, 0, 80), View()
     pictures = MovingPicture(view, lambda: [tool])
-    first = pictures.img_cols_rows[0]
+    first = pictures.draw()
     tool.mesh = Tool(30, 0, 80).mesh
-    assert (pictures.img_cols_rows[0] != first).any()
+    assert (pictures.draw() != first).any()
     assert view.rendered == 1
     view.renderer().GetActiveCamera().Azimuth(30)
-    pictures.img_cols_rows  # noqa: B018
+    pictures.draw()
     assert view.rendered == 2
     view.skull.GetProperty().SetColor(1.0, 0.0, 0.0)
-    assert pictures.img_cols_rows[0].max() == 255
+    assert pictures.draw().max() == 255
     assert view.rendered == 3
     tool.visible = False
-    pictures.img_cols_rows  # noqa: B018
+    pictures.draw()
     assert view.rendered == 4
     pictures.forget()
-    pictures.img_cols_rows  # noqa: B018
+    pictures.draw()
     assert view.rendered == 5
 
 
-class Scheduler:
-    """Stands in for trame-rca's."""
+class Source:
+    """Stands in for what draws a view."""
 
     def __init__(self, name: str, painted: list[str]) -> None:
-        self.name, self.painted, self._push_queue = name, painted, asyncio.Queue()
+        self.name, self.painted, self.forgotten = name, painted, 0
 
-    def _render_frame(self, quality: int) -> None:
+    def draw(self) -> Any:
         self.painted.append(self.name)
+        return np.zeros((4, 6, 3), np.uint8)
+
+    def forget(self) -> None:
+        self.forgotten += 1
 
 
-def painted_of(ask: Any, seconds: float = 0.2) -> list[str]:
-    """What is painted while `ask(views, painter)` runs and a little longer."""
+class Window:
+    """Stands in for a browser window's socket: draws what it gets at once, or what `draws` lets it."""
+
+    def __init__(self, pictures: Pictures, draws: Any = lambda area: True) -> None:
+        self.viewer, self.pictures, self.draws = Viewer(self), pictures, draws
+        pictures._viewers.add(self.viewer)
+
+    async def send_bytes(self, data: bytes) -> None:
+        number, length = HEADER.unpack_from(data)
+        area = data[HEADER.size : HEADER.size + length].decode()
+        if self.draws(area):
+            self.viewer.drew(area, number)
+            self.pictures.freed()
+
+    async def send_str(self, text: str) -> None:
+        pass
+
+
+def painted_of(ask: Any, seconds: float = 0.2, draws: Any = lambda area: True) -> list[str]:
+    """What is painted while `ask(views, painter)` runs and a little longer, and a window draws what `draws` lets it."""
     painted: list[str] = []
 
     async def run() -> None:
-        painter = Painter()
-        views = {name: PacedRendering(name, Scheduler(name, painted), painter, 90) for name in "abc"}
-        task = asyncio.create_task(painter.run())
+        painter = Painter(Pictures())
+        views = {name: PacedRendering(name, Source(name, painted), painter, 90) for name in "abc"}
+        window = Window(painter.pictures, draws)
+        tasks = [asyncio.create_task(painter.run()), asyncio.create_task(window.viewer.send(list))]
         await asyncio.sleep(0)
         await ask(views, painter)
         await asyncio.sleep(seconds)
-        task.cancel()
+        for task in tasks:
+            task.cancel()
 
     asyncio.run(run())
     return painted
@@ -163,18 +188,10 @@ def test_many_requests_become_one_picture():
     assert painted_of(ask) == ["a"]
 
 
-def test_slices_are_free_to_follow_while_a_tool_keeps_the_3d_view_busy():
-    painter = Painter()
-    skull = PacedRendering("skull", Scheduler("skull", []), painter, 90)
-    skull.schedule_render()
-    assert painter.waits_for(frozenset({"skull"}))
-    assert not painter.waits_for(frozenset({"axial", "sagittal"}))
-
-
-def test_a_busy_view_does_not_keep_the_others_from_being_painted():
+def test_no_view_keeps_the_others_from_being_painted():
     async def ask(views: Any, _: Any) -> None:
-        for _ in range(40):
-            for name in "abc":
+        for _ in range(60):
+            for name in "aaabc":
                 views[name].schedule_render()
             await asyncio.sleep(0.005)
 
@@ -184,28 +201,54 @@ def test_a_busy_view_does_not_keep_the_others_from_being_painted():
     assert min(counts) >= 2
 
 
-def test_nothing_is_painted_for_what_is_not_to_be_seen_or_cannot_be_sent():
+def test_what_the_round_brings_into_the_scene_is_in_its_pictures():
+    order: list[str] = []
+
+    async def ask(views: Any, painter: Any) -> None:
+        views["a"].source.painted = order
+
+        def lead() -> None:
+            order.append("lead")
+            views["a"].schedule_render()
+
+        painter.before_round = lead
+        views["b"].schedule_render()
+
+    painted_of(ask, 0.05)
+    assert order[:2] == ["lead", "a"]
+
+
+def test_a_defect_in_one_view_stops_neither_the_others_nor_itself():
+    async def ask(views: Any, _: Any) -> None:
+        draw = views["a"].source.draw
+        views["a"].source.draw = lambda: 1 // 0
+        views["a"].schedule_render()
+        views["b"].schedule_render()
+        await asyncio.sleep(0.1)
+        views["a"].source.draw = draw
+        views["a"].schedule_render()
+
+    assert painted_of(ask) == ["b", "a"]
+
+
+def test_nothing_is_painted_for_what_is_not_to_be_seen_or_cannot_be_shown():
     async def ask(views: Any, painter: Any) -> None:
         painter.muted = True
         views["a"].schedule_render()
         painter.muted = False
-        for _ in range(2):
-            views["b"]._scheduler._push_queue.put_nowait(None)
-        views["b"].schedule_render()
+        for _ in range(8):
+            views["b"].schedule_render()
+            await asyncio.sleep(0.05)
         views["c"].schedule_render()
 
-    assert painted_of(ask) == ["c"]
+    assert painted_of(ask, draws=lambda area: area != "b") == ["b"] * MOST_ON_THEIR_WAY + ["c"]
 
 
 def test_only_what_stands_still_makes_a_kept_picture_old():
-    forgotten = []
-
-    async def ask(views: Any, painter: Any) -> None:
-        views["a"].draw_with(SimpleNamespace(forget=lambda: forgotten.append("a")))
-        with painter.while_moving():
-            views["a"].schedule_render()
-        assert not forgotten
-        views["a"].schedule_render()
-
-    painted_of(ask, 0.0)
-    assert forgotten == ["a"]
+    painter, source = Painter(Pictures()), Source("a", [])
+    view = PacedRendering("a", source, painter, 90)
+    with painter.while_moving():
+        view.schedule_render()
+    assert not source.forgotten
+    view.schedule_render()
+    assert source.forgotten == 1

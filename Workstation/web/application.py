@@ -21,6 +21,7 @@ from Workstation.web.built_once import built_once
 from Workstation.web.drawings import drawings
 from Workstation.web.page import Page
 from Workstation.web.panel_view import PanelView
+from Workstation.web.pictures import Pictures
 from Workstation.web.procedure import HAND, NAVIGATION, PROCEDURE, REGISTRATION, SESSION, TRACKING, ULTRASOUND, modules_of
 from Workstation.web.session_files import Places
 from Workstation.web.session_files_view import FilesDialog
@@ -49,6 +50,7 @@ class WorkstationApp(TrameApp):
         self.server.enable_module(slicer_views)
         self.windows = Windows(self.server.state, self._draw_again)
         self.server.add_protocol_to_configure(lambda protocol: protocol.registerLinkProtocol(self.windows))
+        self.pictures = Pictures()
         with host.quiet(), built_once():
             self._make_views()
         self.runner = BackgroundRunner()
@@ -61,6 +63,7 @@ class WorkstationApp(TrameApp):
             key = panel.module.replace("Module", "").lower()
             model = PanelModel(panel, logic, self.runner)
             self.panels[panel.module] = PanelView(self.server, model, key, self.places.shown, self.places.meant, self._poll)
+        self._place: tuple[Any, ...] = ()  # that the slices show
         self._in_turn = itertools.cycle(self.panels)  # of panels that are not shown, one at a time is looked at
         self._use_folder()
         self.views, self.cues = ViewFollower(self.slicer), Cues()
@@ -97,16 +100,19 @@ class WorkstationApp(TrameApp):
 
         self.slicer = SlicerApp()
         host.adopt_scene(self.slicer.scene, self.slicer.app_logic)
-        register_quiet_factories(self.slicer.view_manager, self.server, PICTURE_QUALITY)
+        register_quiet_factories(self.slicer.view_manager, self.server)
         self.layouts = LayoutManager(self.slicer.scene, self.slicer.view_manager, self.server)
         # the views are made here: made inside the page, their widgets would land between the page's own
         self.layouts.register_layout_dict(layout_grid())
         self.layouts.set_layout("four")
-        self.painter = Painter()
-        paced = pace(self.slicer.view_manager.get_views(), self.painter, PICTURE_QUALITY)
-        self._slices = frozenset(view.get_view_node_id() for view in self.slicer.view_manager.get_slice_views())
-        for view in self.slicer.view_manager.get_threed_views():
-            paced[view.get_view_node_id()].draw_with(MovingPicture(view, lambda: self.views.moving_models()))
+        self.painter = Painter(self.pictures)
+        self.painter.before_round = self._lead
+        manager = self.slicer.view_manager
+        for view in manager.get_slice_views():
+            pace(view, get_view_trame_id(self.server, view), self.painter, PICTURE_QUALITY)
+        for view in manager.get_threed_views():
+            still = MovingPicture(view, lambda: self.views.moving_models())
+            pace(view, get_view_trame_id(self.server, view), self.painter, PICTURE_QUALITY, still)
 
     def _use_folder(self) -> None:
         """The modules write into the session's folder unless the user says otherwise."""
@@ -148,11 +154,30 @@ class WorkstationApp(TrameApp):
         self.painter.muted = False
 
     def _move(self, turn: int) -> None:
-        """Hide lost tools; let the slices follow the leading one, as soon as they show where it was before."""
+        """Hide lost tools; have the views drawn anew that follow the leading one."""
         self.views.show_tools(self._forerun_mm())
-        if self.server.state.step == "navigation" and not self.painter.waits_for(self._slices):
+        place = self._followed()
+        if place != self._place:
+            with self.painter.while_moving():
+                for view in self.slicer.view_manager.get_views():
+                    view.schedule_render()
+
+    def _lead(self) -> None:
+        """Just before the views are painted: the newest poses, and the slices where the leading tool is now."""
+        self._poll()
+        place = self._followed()
+        if place != self._place:
+            self._place = place
             with self.painter.while_moving():
                 self._navigate()
+
+    def _followed(self) -> tuple[Any, ...]:
+        """What the slices follow in navigation."""
+        if self.server.state.step != "navigation":
+            return ()
+        logic = self.logics[NAVIGATION]
+        found = logic.tip()
+        return (found is not None and tuple(found[1]), logic.parameters().read())
 
     def _turn(self, turn: int) -> None:
         if turn % REFRESH_EVERY == 0:

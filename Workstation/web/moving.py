@@ -26,7 +26,7 @@ class Still:
 
 
 class MovingPicture:
-    """The picture of a 3-D view for trame-rca's scheduler (`img_cols_rows`).
+    """The picture of a 3-D view.
 
     Parameters
     ----------
@@ -36,13 +36,10 @@ class MovingPicture:
     """
 
     def __init__(self, view: Any, models: Callable[[], Iterable[Any]]) -> None:
-        from slicer import vtkMRMLLayerDisplayableManager
         from vtkmodules.vtkCommonCore import vtkFloatArray, vtkUnsignedCharArray
-        from vtkmodules.vtkCommonDataModel import vtkImageData
         from vtkmodules.vtkRenderingCore import vtkRenderer, vtkRenderWindow
 
         self._view, self._models = view, models
-        self._read_buffer, self._image = vtkMRMLLayerDisplayableManager.RenderWindowBufferToImage, vtkImageData()
         self._depths, self._pixels = vtkFloatArray(), vtkUnsignedCharArray()
         self._window, self._renderer = vtkRenderWindow(), vtkRenderer()
         self._window.SetOffScreenRendering(1)
@@ -57,16 +54,16 @@ class MovingPicture:
         """Something that stands still has changed."""
         self._still = None
 
-    @property
-    def img_cols_rows(self) -> tuple[npt.NDArray[np.uint8], int, int]:
-        """The picture (height, width, 3) from the top down, its height and its width."""
+    def draw(self) -> npt.NDArray[np.uint8]:
+        """The picture (height, width, 3) from the bottom up; it is not written into later."""
         moving = self._place_actors()
         if self._still is None or self._still.stamp != self._stamp(moving):
             self._still = self._draw_still(moving)
+        if not moving:
+            return self._still.colors
         picture = self._still.colors.copy()
-        if moving:
-            self._lay_over(picture, self._still)
-        return np.ascontiguousarray(picture[::-1]), picture.shape[0], picture.shape[1]
+        self._lay_over(picture, self._still)
+        return picture
 
     def _stamp(self, moving: bool) -> tuple[Any, ...]:
         """Of the window's size, the camera, and everything that is drawn."""
@@ -80,14 +77,15 @@ class MovingPicture:
     def _draw_still(self, moving: bool) -> Still:
         from vtkmodules.util.numpy_support import vtk_to_numpy
 
+        from Workstation.web.pacing import pixels_of
+
         window = self._view.render_window()
         for prop in self._props():
             if prop.IsA(CROSSHAIR):  # it follows the tip: where a tool is to be seen, that is the place
                 prop.SetVisibility(not moving)
         window.Render()
-        self._read_buffer(window, self._image)
-        width, height, _ = self._image.GetDimensions()
-        colors = vtk_to_numpy(self._image.GetPointData().GetScalars()).reshape(height, width, -1)[..., :3].copy()
+        colors = pixels_of(window)
+        height, width, _ = colors.shape
         window.GetZbufferData(0, 0, width - 1, height - 1, self._depths)
         depths = _before_the_eye(vtk_to_numpy(self._depths).reshape(height, width), self._view.renderer().GetActiveCamera())
         return Still(self._stamp(moving), colors, depths)

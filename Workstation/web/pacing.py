@@ -1,4 +1,4 @@
-"""Paints the views in turn, no more often than the machine can afford, so that devices and clicks are served in between."""
+"""Paints the views in rounds, no more often than machine and windows can afford; devices and clicks are served in between."""
 
 from __future__ import annotations
 
@@ -6,27 +6,34 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
+from slicer import vtkMRMLLayerDisplayableManager
 from trame_slicer.rca_view.rca_view_factory import RemoteViewFactory
 from trame_slicer.views import ScheduledRenderStrategy, SliceView, ThreeDView, ViewType
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkCommonDataModel import vtkImageData
 
+from Workstation.web.pictures import Picture, Pictures, encoded
 from Workstation.web.view_frame import slice_frame, threed_frame
 
-FASTEST_S = 1 / 30  # between two pictures of one view
+FASTEST_S = 1 / 25  # between two rounds; what is left of the machine is the browser's
 SHARE = 0.8  # of the event loop's time that painting may take while there is always something to paint
-MOST_ENCODING = 2  # pictures of one view on their way; a further one would only be older when it arrives
 LOG = logging.getLogger(__name__)
 
 
 class Painter:
-    """Paints the views that have asked for it, one at a time, the one that has waited longest first."""
+    """Paints in rounds: what is new is brought into the scene, then each view that has asked for it is painted once."""
 
-    def __init__(self) -> None:
+    def __init__(self, pictures: Pictures) -> None:
         self.muted = False  # requests are dropped: what changes now is not drawn
         self.moving = False  # requests come from tools that move; all else stands still
+        self.before_round: Callable[[], None] = bool
+        self.pictures = pictures
+        pictures.freed = self.wake
         self._wanted: dict[str, PacedRendering] = {}
         self._news: asyncio.Event | None = None
 
@@ -39,94 +46,115 @@ class Painter:
         finally:
             self.moving = False
 
-    def waits_for(self, names: frozenset[str]) -> bool:
-        """Whether one of these views is still to be painted."""
-        return not names.isdisjoint(self._wanted)
-
     def ask(self, name: str, view: PacedRendering) -> None:
         """A view wants to be painted."""
-        self._wanted.setdefault(name, view)
+        self._wanted[name] = view
+        self.pictures.outdated(name)
+        self.wake()
+
+    def wake(self) -> None:
+        """Something may have become possible."""
         if self._news is not None:
             self._news.set()
 
     async def run(self, **_: Any) -> None:
         """Paint for ever. In the server's event loop."""
         self._news = asyncio.Event()
+        next_s = 0.0
         while True:
-            ready = [(view.last_s, name) for name, view in self._wanted.items() if view.can_take_one()]
-            if not ready:
-                self._news.clear()
-                pause = FASTEST_S if self._wanted else None
-                with suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(self._news.wait(), pause)
+            self._news.clear()
+            if not self._ready():
+                await self._news.wait()
                 continue
-            last_s, name = min(ready)
-            too_early_s = last_s + FASTEST_S - time.monotonic()
-            if too_early_s > 0:
-                await asyncio.sleep(too_early_s)
-                continue  # another view may have been asked for that has waited longer
-            await asyncio.sleep(self._paint(self._wanted.pop(name)))
+            await asyncio.sleep(max(0.0, next_s - time.monotonic()))
+            next_s = time.monotonic() + FASTEST_S
+            self._attempt(self.before_round)
+            for name in self._ready():
+                begun_s = time.monotonic()
+                self._attempt(self._wanted.pop(name).paint)
+                await asyncio.sleep((time.monotonic() - begun_s) * (1 / SHARE - 1))
 
-    def _paint(self, view: PacedRendering) -> float:
-        """Returns for how long to let others work."""
-        begun = time.monotonic()
+    def _ready(self) -> list[str]:
+        """Views that want a picture which could go out at once."""
+        return [name for name, view in self._wanted.items() if not view.encoding and self.pictures.takes(name)]
+
+    def _attempt(self, what: Callable[[], None]) -> None:
         try:
-            view.paint()
+            what()
         except Exception:  # one view's defect must not stop the others
             LOG.exception("a view could not be painted")
-        return (time.monotonic() - begun) * (1 / SHARE - 1)
+
+
+class WindowPicture:
+    """The picture of a render window, drawn anew each time."""
+
+    def __init__(self, window: Any) -> None:
+        self._window = window
+
+    def draw(self) -> Any:
+        """Pixels (height, width, 3) from the bottom up; nobody else writes into them."""
+        self._window.Render()
+        return pixels_of(self._window)
+
+    def forget(self) -> None:
+        """Nothing is kept."""
 
 
 class PacedRendering(ScheduledRenderStrategy):  # type: ignore[misc]
-    """A view's requests go to the painter; `scheduler` (trame-rca's) renders, encodes and sends one picture."""
+    """A view's requests go to the painter; `source` draws its picture, which is encoded in a thread and then sent."""
 
-    def __init__(self, name: str, scheduler: Any, painter: Painter, quality: int) -> None:
+    encoders = ThreadPoolExecutor(2, "cranionav-encode")
+
+    def __init__(self, name: str, source: Any, painter: Painter, quality: int) -> None:
         super().__init__()
-        self._name, self._scheduler, self._painter, self._quality = name, scheduler, painter, quality
-        self.last_s = 0.0
-        self.changed: Callable[[], None] = bool  # called when more than a moving tool has changed
-        scheduler.schedule_render = self.schedule_render  # of its own accord it renders when the page resizes the view
-
-    def draw_with(self, pictures: Any) -> None:
-        """Let another object make the pictures (its `img_cols_rows`); it is told when more than a moving tool has changed."""
-        self._scheduler._rca, self.changed = pictures, pictures.forget
+        self.source, self.encoding = source, False
+        self._name, self._painter, self._quality = name, painter, quality
 
     def schedule_render(self) -> None:
         """Ask for a picture."""
         if self._painter.muted:
             return
         if not self._painter.moving:
-            self.changed()
+            self.source.forget()
         self._painter.ask(self._name, self)
 
-    def can_take_one(self) -> bool:
-        """Whether the pictures before are on their way."""
-        return bool(self._scheduler._push_queue.qsize() < MOST_ENCODING)
-
     def paint(self) -> None:
-        """Render, and have the picture encoded and sent."""
-        self.last_s = time.monotonic()
-        self._scheduler._render_frame(self._quality)
+        """Draw, and have the picture encoded and sent. In the event loop."""
+        picture = self._painter.pictures.begun(self._name)
+        pixels = self.source.draw()
+        self.encoding = True
+        work = asyncio.get_running_loop().run_in_executor(self.encoders, encoded, pixels, self._quality)
+        work.add_done_callback(partial(self._send, picture))
+
+    def _send(self, picture: Picture, work: asyncio.Future[bytes]) -> None:
+        self.encoding = False
+        picture.content = work.result()
+        self._painter.pictures.offer(picture)
+        self._painter.wake()
 
 
-def register_quiet_factories(view_manager: Any, server: Any, quality: int) -> None:
+def pixels_of(window: Any) -> Any:
+    """What a window shows, (height, width, 3) from the bottom up."""
+    image = vtkImageData()  # a new one each time, so that it may be encoded while the next is drawn
+    vtkMRMLLayerDisplayableManager.RenderWindowBufferToImage(window, image)
+    width, height, _ = image.GetDimensions()
+    return vtk_to_numpy(image.GetPointData().GetScalars()).reshape(height, width, 3)
+
+
+def register_quiet_factories(view_manager: Any, server: Any) -> None:
     """Views for the page that do not render while they are made, as nobody looks at them yet."""
     for kind, view_type, controls in (
         (SliceView, ViewType.SLICE_VIEW, slice_frame),
         (ThreeDView, ViewType.THREE_D_VIEW, threed_frame),
     ):
         quiet = partial(kind, scheduled_render_strategy=ScheduledRenderStrategy())
-        view_manager.register_factory(
-            RemoteViewFactory(server, quiet, view_type, populate_view_ui_f=controls, interactive_quality=quality)
-        )
+        view_manager.register_factory(RemoteViewFactory(server, quiet, view_type, populate_view_ui_f=controls))
 
 
-def pace(views: list[Any], painter: Painter, quality: int) -> dict[str, PacedRendering]:
-    """Let one painter paint all views; costly smoothing of edges is left out, as there is no graphics card to do it."""
-    paced = {}
-    for view in views:
-        view.render_window().SetMultiSamples(0)
-        name = view.get_view_node_id()
-        paced[name] = PacedRendering(name, view._scheduled_render._scheduler, painter, quality)
-        view.set_scheduled_render(paced[name])
-    return paced
+def pace(view: Any, area: str, painter: Painter, quality: int, source: Any = None) -> None:
+    """Let the painter paint a view; costly smoothing of edges is left out, as there is no graphics card to do it."""
+    window = view.render_window()
+    window.SetMultiSamples(0)
+    paced = PacedRendering(area, source or WindowPicture(window), painter, quality)
+    view._scheduled_render._scheduler.schedule_render = paced.schedule_render  # asked when the page resizes the view
+    view.set_scheduled_render(paced)

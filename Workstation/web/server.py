@@ -32,6 +32,7 @@ def serve(
     server = get_server(client_type="vue3")
     _silence_vtk()
     from Workstation.web.application import WorkstationApp
+    from Workstation.web.pictures import PICTURES
     from Workstation.web.session_link import ALIVE
 
     application = WorkstationApp(server, case, data)
@@ -41,6 +42,7 @@ def serve(
         web.app.router.add_get("/session/{name}", _file_of(application))
         web.app.router.add_get(f"/{ALIVE}", _alive_of(application.windows))
         web.app.router.add_post("/upload", _upload_of(application))
+        web.app.router.add_get(f"/{PICTURES}", application.pictures.serve)
         application.windows.guard(web)
 
     def ready(**_: Any) -> None:

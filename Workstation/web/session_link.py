@@ -5,6 +5,7 @@ from __future__ import annotations
 from trame.widgets import client, html
 from trame.widgets import vuetify3 as v3
 
+from Workstation.web.pictures_view import draw_script
 from Workstation.web.session_windows import OPEN, TAKE
 
 ALIVE = "alive"  # address that the page asks whether the server is there
@@ -19,7 +20,6 @@ STYLE = """
 .link-watching { position: fixed; bottom: 0; right: 0; left: 580px; z-index: 900; display: flex; align-items: center;
   justify-content: center; gap: 16px; padding: 8px; background: #3a2f12; color: #f0b429; border-top: 2px solid #f0b429; }
 [inert] .v-btn, [inert] .v-field, [inert] .v-list-item { opacity: 0.6; }
-.image-display-area { height: 100%; object-fit: contain; }
 """
 
 # A window keeps its name over reloads; a copy of the tab, which the browser gives the same storage, takes another one.
@@ -91,3 +91,4 @@ def draw_link() -> None:
         html.Div("! {{ control.text }}; this window watches", classes="text-body-1")
         v3.VBtn("Take control", variant="flat", color="primary", size="small", raw_attrs=["data-take-control"])
     client.Script(SCRIPT)
+    draw_script()

@@ -10,12 +10,11 @@ from typing import Any
 from wslink import register
 from wslink.websocket import LinkProtocol
 
-STATE_TOPIC, PICTURES_TOPIC = "trame.state.topic", "trame.rca.topic.stream"
+STATE_TOPIC = "trame.state.topic"
 OPEN, TAKE = "cranionav.window.open", "cranionav.window.take"
 WATCHER_MAY = frozenset({"wslink.hello", "trame.state.get", "trame.lifecycle.update", "trame.error.client", OPEN, TAKE})
 LOCAL_STATE = frozenset({"keys", "muted", "my_window", "trame__busy"})  # each window's own: not shared
 NOBODY = {"window": 0, "text": ""}
-BACKLOG_BYTES = 1_000_000  # of a connection that is slower than the pictures; it gets none until this has gone out
 LOST_BYTES = 16_000_000  # of one that takes nothing any more; it is closed, and comes back by itself
 
 
@@ -53,7 +52,6 @@ class Windows(LinkProtocol):  # type: ignore[misc]
             handler.sendWrappedError = _without_traces(handler.sendWrappedError)
             for protocol in handler.serverProtocol.getLinkProtocols():
                 if hasattr(protocol, "push_content"):
-                    protocol.publish = self._to_those_who_keep_up(protocol.publish)
                     self._resize = protocol.update_size
 
     def onConnect(self, request: Any, client_id: str) -> None:
@@ -159,17 +157,6 @@ class Windows(LinkProtocol):  # type: ignore[misc]
                 self._draw_again(str(arguments[0]))
 
         return on_complete_message
-
-    def _to_those_who_keep_up(self, publish: Callable[..., None]) -> Callable[..., None]:
-        def publish_pictures(topic: str, data: Any, client_id: str | None = None, **options: Any) -> None:
-            if topic != PICTURES_TOPIC or client_id is not None:
-                publish(topic, data, client_id=client_id, **options)
-                return
-            for client, connection in self._connections.items():
-                if connection.transport.get_write_buffer_size() < BACKLOG_BYTES:
-                    publish(topic, data, client_id=client, **options)
-
-        return publish_pictures
 
 
 def _without_traces(send: Callable[..., Awaitable[None]]) -> Callable[..., Awaitable[None]]:

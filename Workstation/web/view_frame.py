@@ -9,6 +9,7 @@ from trame_slicer.app.logic.slice_view_logic import connect_slice_view_slider_to
 from trame_slicer.app.ui.slider import Slider
 
 from Workstation.web import words
+from Workstation.web.pictures_view import draw_picture
 
 PLACES = (
     "left: 8px; top: 50%; transform: translateY(-50%)",
@@ -32,6 +33,7 @@ LEGEND = """
 def slice_frame(server: Any, view_id: str, view: Any) -> None:
     """Over a slice view."""
     name = view.get_orientation()
+    draw_picture(view_id)
     html.Div(name, classes="over over-name")
     for side, place in zip(words.SIDES.get(name, ()), PLACES, strict=False):
         html.Div(side, classes="over", style=place)
@@ -41,5 +43,6 @@ def slice_frame(server: Any, view_id: str, view: Any) -> None:
 
 def threed_frame(server: Any, view_id: str, view: Any) -> None:
     """Over a 3-D view."""
+    draw_picture(view_id)
     html.Div(words.SOLID, classes="over over-name")
     html.Div(LEGEND, v_if="legend", classes="over legend", raw_attrs=["data-legend"])

@@ -43,6 +43,7 @@ SIDES = {  # left, right, top and bottom of a slice as radiology shows it
 EXPECTED_ERROR, WITH_POINTS = "Expected error, 95 %", "expected with the {count} points taken"
 BONE_POINTS, LEFT_OUT = "Bone points: distance to the bone", "crosses: {count} left out"
 SCALE_END = "≥ {most:g} mm"
+PICTURE_OLD = "picture {seconds} s old"
 
 # Live drawings
 A_LINE, A_LINE_HINT = "A-line", "A-line; the light band is the gate"
