@@ -3,15 +3,29 @@
 from __future__ import annotations
 
 import asyncio
+import importlib.util
 import io
 import json
+import re
+import sys
+import threading
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from PIL import Image
 
-from Workstation.web.pictures import HEADER, MOST_ON_THEIR_WAY, Pictures, Viewer, encoded
+from Workstation.web.pictures import HEADER, MOST_ON_THEIR_WAY, PICTURES, Pictures, Viewer, encoded
+from Workstation.web.pictures_view import SCRIPT
+
+_SPEC = importlib.util.spec_from_file_location("workstation_user", Path(__file__).with_name("workstation_user.py"))
+assert _SPEC is not None
+assert _SPEC.loader is not None
+user_module: Any = importlib.util.module_from_spec(_SPEC)
+sys.modules["workstation_user"] = user_module
+_SPEC.loader.exec_module(user_module)
 
 
 class Socket:
@@ -103,3 +117,79 @@ def test_a_picture_is_encoded_the_right_way_up():
     assert picture.shape == (40, 60, 3)
     assert picture[30, 30, 0] > 200
     assert picture[10, 30].max() < 50
+
+
+PAGE = """<!doctype html><div class="view"><canvas data-picture="axial" style="width: 120px; height: 80px"></canvas>
+<div data-behind="axial" style="display: none"></div></div><script>{script}</script>"""
+
+
+class Room:
+    """The pictures' side of the workstation, with an event loop in a thread of its own, and a page with one view."""
+
+    def __init__(self) -> None:
+        self.pictures, self.loop, self.url = Pictures(), asyncio.new_event_loop(), ""
+        self._thread = threading.Thread(target=self.loop.run_forever, daemon=True)
+
+    def __enter__(self) -> Room:
+        self._thread.start()
+        self.url = asyncio.run_coroutine_threadsafe(self._serve(), self.loop).result(20)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.loop.call_soon_threadsafe(self.loop.stop)
+        self._thread.join()
+
+    async def _serve(self) -> str:
+        from aiohttp import web
+
+        application = web.Application()
+        application.router.add_get(f"/{PICTURES}", self.pictures.serve)
+        application.router.add_get("/", self._page)
+        runner = web.AppRunner(application)
+        await runner.setup()
+        await web.TCPSite(runner, "127.0.0.1", 0).start()
+        return f"http://127.0.0.1:{runner.addresses[0][1]}/"
+
+    async def _page(self, _: Any) -> Any:
+        from aiohttp import web
+
+        return web.Response(text=PAGE.format(script=SCRIPT), content_type="text/html")
+
+    def does(self, what: Any) -> None:
+        self.loop.call_soon_threadsafe(what)
+
+    def paint(self, level: int) -> None:
+        """A grey picture of the view."""
+
+        def offer() -> None:
+            picture = self.pictures.begun("axial")
+            picture.content = encoded(np.full((40, 60, 3), level, np.uint8), 90)
+            self.pictures.offer(picture)
+
+        self.does(offer)
+
+
+@pytest.mark.skipif(not Path(user_module.BROWSER).exists(), reason="no Chromium on this machine")
+def test_a_view_says_that_its_picture_is_old_and_no_longer_when_it_is_not():
+    grey = "() => document.querySelector('canvas').getContext('2d').getImageData(30, 20, 1, 1).data[0]"
+    with Room() as room, user_module.browsing() as user:
+        page, sign = user.page, user.page.locator("[data-behind]")
+        page.goto(room.url)
+        room.paint(200)
+        page.wait_for_function(f"({grey})() > 190")
+        assert not sign.is_visible()
+        room.does(lambda: room.pictures.outdated("axial"))  # nobody paints
+        sign.filter(has_text=re.compile(r"picture 0\.[6-9] s old")).wait_for()
+        sign.filter(has_text=re.compile(r"picture 1\.\d s old")).wait_for()
+        room.paint(100)
+        page.wait_for_function(f"({grey})() < 110")
+        sign.wait_for(state="hidden")
+        room.does(lambda: time.sleep(2))  # the server is stuck, so that nobody knows whether there is more to be shown
+        sign.filter(has_text=re.compile(r"picture [01]\.\d s old")).wait_for()
+        sign.wait_for(state="hidden")
+        page.evaluate("() => { window.view = document.querySelector('.view'); window.view.remove(); }")
+        room.paint(50)  # another layout is open meanwhile
+        page.wait_for_timeout(300)
+        page.evaluate("() => document.body.append(window.view)")
+        page.wait_for_function(f"({grey})() < 60")
+        assert user.defects == []
