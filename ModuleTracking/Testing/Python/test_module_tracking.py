@@ -196,8 +196,8 @@ def test_pivoting_calibrates_the_tip_and_the_scene_shows_it_from_then_on(a_logic
     a_logic.parameters().change(pivot_s=1.0)
     a_logic.startPivot()
     assert a_logic.digitiseBlocked() == "a tool is being calibrated"
-    run_until(a_logic, lambda: "Stylus" in a_logic._calibrator.found)
-    np.testing.assert_allclose(a_logic._calibrator.found["Stylus"].tool_to_marker[:3, 3], TIP, atol=1e-6)
+    run_until(a_logic, lambda: "Stylus" in a_logic.calibrator.found)
+    np.testing.assert_allclose(a_logic.calibrator.found["Stylus"].tool_to_marker[:3, 3], TIP, atol=1e-6)
     run_for(a_logic, 0.1)
     np.testing.assert_allclose(scene_data.get_transform("StylusToReference")[:3, 3], DIVOT, atol=1e-6)
     assert a_logic.calibrationStatus().state is StepState.DONE
@@ -208,8 +208,8 @@ def test_a_tool_held_still_cannot_be_calibrated_and_the_panel_says_why(a_logic):
     run_until(a_logic, seen())
     a_logic.parameters().change(pivot_s=1.0)
     a_logic.startPivot()
-    run_until(a_logic, lambda: not a_logic._calibrator.busy)
-    assert "Stylus" not in a_logic._calibrator.found
+    run_until(a_logic, lambda: not a_logic.calibrator.busy)
+    assert "Stylus" not in a_logic.calibrator.found
     assert "tilt" in a_logic.pivotProgress().text
     assert a_logic.calibrationStatus().state is StepState.ATTENTION
 
@@ -309,8 +309,8 @@ def calibrate_stylus(logic):
     run_until(logic, seen())
     logic.parameters().change(pivot_s=1.0)
     logic.startPivot()
-    run_until(logic, lambda: not logic._calibrator.busy)
-    assert "Stylus" in logic._calibrator.found, logic.pivotProgress()
+    run_until(logic, lambda: not logic.calibrator.busy)
+    assert "Stylus" in logic.calibrator.found, logic.pivotProgress()
 
 
 def test_a_base_that_moved_on_its_clamp_is_told_by_touching_the_divot_again(a_logic, tmp_path):
@@ -343,8 +343,8 @@ def test_what_was_calibrated_is_there_again_and_only_for_the_same_tool(a_logic, 
     a_logic.disconnect()
     other = module.ModuleTrackingLogic()
     other.connect()
-    run_until(other, lambda: "Stylus" in other._calibrator.found)
-    run_until(other, lambda: other._base.point is not None)
+    run_until(other, lambda: "Stylus" in other.calibrator.found)
+    run_until(other, lambda: other.base.point is not None)
     run_for(other, 0.1)
     np.testing.assert_allclose(scene_data.get_transform("StylusToReference")[:3, 3], DIVOT, atol=0.1)
     other.disconnect()
@@ -353,7 +353,7 @@ def test_what_was_calibrated_is_there_again_and_only_for_the_same_tool(a_logic, 
     for logic in (other, module.ModuleTrackingLogic()):  # one that remembers, one that reads the folder
         logic.connect()
         run_until(logic, lambda logic=logic: logic._identified)
-        assert "Stylus" not in logic._calibrator.found
+        assert "Stylus" not in logic.calibrator.found
         assert "does not fit" in logic.calibrationStatus().text
         assert "another reference tool" in logic.baseCheck().text or "belongs to reference tool" in logic.baseCheck().text
         logic.disconnect()
@@ -371,8 +371,8 @@ def test_a_rolled_tool_gets_its_axis(a_logic):
     run_for(a_logic, 0.1)
     a_logic.parameters().change(pivot_s=2.0)
     a_logic.startSpin()
-    run_until(a_logic, lambda: not a_logic._calibrator.busy)
-    found = a_logic._calibrator.found["Stylus"]
+    run_until(a_logic, lambda: not a_logic.calibrator.busy)
+    found = a_logic.calibrator.found["Stylus"]
     assert found.method == "pivot and spin", a_logic.pivotProgress()
     np.testing.assert_allclose(found.tool_to_marker[:3, 2], axis, atol=1e-6)
     np.testing.assert_allclose(found.tool_to_marker[:3, 3], TIP, atol=1e-6)

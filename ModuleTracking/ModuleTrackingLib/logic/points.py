@@ -1,0 +1,91 @@
+"""The points step: the resting tip of a tool becomes the next point of a list."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from CranioNavLib import scene
+from CranioNavLib.errors import InputError
+from CranioNavLib.module_logic import done_or, todo
+from CranioNavLib.panel import Level, Reading, StepStatus
+from CranioNavLib.rigid import Array
+from CranioNavLib.slicer_files import LabelledPoints, add_points
+
+from ModuleTrackingLib.digitise import rest_of_tip
+from ModuleTrackingLib.logic.calibrating import CalibrationStep
+from ModuleTrackingLib.panel_description import PointList
+
+APART_MM = 2.0  # a point so near to the one read before is the same one again
+PLANNED = {PointList.LANDMARKS: "LandmarksCT", PointList.TARGETS: "TargetsCT"}  # where the names of the points come from
+LETTERS = {PointList.LANDMARKS: "L", PointList.BONE: "B", PointList.TARGETS: "T", PointList.PLAUSIBILITY: "P"}
+
+
+class PointsStep(CalibrationStep):
+    """Points touched on the patient."""
+
+    def digitise(self) -> str:
+        """Add the resting tip of the chosen tool to the chosen list. Returns a message."""
+        wanted = self.parameters().read()
+        rest = rest_of_tip(self.restingTips(wanted.tool.value))
+        label = next_label(wanted.points)
+        node = scene.find_or_create(wanted.points.value)
+        _refuse_twice(node, rest.position_mm, label)
+        add_points(node, LabelledPoints((label,), rest.position_mm[None]))
+        return f"{label}: {rest.samples} samples, spread {rest.spread_mm:.2f} mm (RMS)"
+
+    def digitiseBlocked(self) -> str:
+        """Why no point can be read now."""
+        if _all_read(self.parameters().read().points):
+            return "every planned point is read; undo the last to read it again"
+        return self.notConnected() or self.calibrating()
+
+    def undoPoint(self) -> str:
+        """Remove the last point of the chosen list. Returns a message."""
+        node = scene.find_or_create(self.parameters().read().points.value)
+        last = node.GetNumberOfControlPoints() - 1
+        label = node.GetNthControlPointLabel(last)
+        node.RemoveNthControlPoint(last)
+        return f"{label} removed"
+
+    def undoPointBlocked(self) -> str:
+        """Why there is no point to remove."""
+        return "" if _labels(self.parameters().read().points.value) else "the list has no points"
+
+    def nextPoint(self) -> Reading:
+        """The label that the next point gets."""
+        points = self.parameters().read().points
+        return Reading("all are read", Level.GOOD) if _all_read(points) else Reading(next_label(points))
+
+    def pointsStatus(self) -> StepStatus:
+        """Whether every planned landmark is digitised."""
+        touched = _labels("LandmarksPatient")
+        missing = [label for label in _labels("LandmarksCT") if label not in touched]
+        return todo(f"still to touch: {', '.join(missing)}") if missing else done_or(bool(touched), "touch the landmarks")
+
+
+def next_label(points: PointList) -> str:
+    """The first planned label that is not taken yet; a number where nothing is planned."""
+    taken = _labels(points.value)
+    free = [label for label in _planned(points) if label not in taken]
+    return free[0] if free else f"{LETTERS[points]}{len(taken) + 1}"
+
+
+def _refuse_twice(node: Any, position: Array, label: str) -> None:
+    """A key pressed twice must not make the next point of the place of the last."""
+    last = node.GetNumberOfControlPoints() - 1
+    if last >= 0 and np.linalg.norm(np.array(node.GetNthControlPointPosition(last)) - position) < APART_MM:
+        raise InputError(f"the tip still rests on {node.GetNthControlPointLabel(last)}; move it to {label} and read the point")
+
+
+def _planned(points: PointList) -> list[str]:
+    return _labels(PLANNED[points]) if points in PLANNED else []
+
+
+def _all_read(points: PointList) -> bool:
+    return bool(_planned(points)) and set(_planned(points)) <= set(_labels(points.value))
+
+
+def _labels(role: str) -> list[str]:
+    node = scene.find(role)
+    return [node.GetNthControlPointLabel(i) for i in range(node.GetNumberOfControlPoints())] if node is not None else []
