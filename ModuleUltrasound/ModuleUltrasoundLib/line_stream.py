@@ -154,11 +154,12 @@ def recording_of(posed: list[PosedLine], acquisition: Acquisition) -> Recording:
         lines=np.stack([item.line.samples for item in posed]),
         acquisition=acquisition,
         probe_to_reference=np.stack([nowhere if matrix is None else matrix for matrix in matrices]),
-        statuses=tuple("OK" if item.pose.usable else _word(item.pose.status) for item in posed),
+        statuses=tuple("OK" if item.pose.usable else status_word(item.pose.status) for item in posed),
         timestamps_s=np.array([item.line.host_time_s - posed[0].line.host_time_s for item in posed]),
         palpation_points=np.array([item.palpation_point for item in posed], dtype=np.int64),
     )
 
 
-def _word(status: PoseStatus) -> str:
+def status_word(status: PoseStatus) -> str:
+    """Why a line has no pose, as recordings say it."""
     return "MISSING" if status in (PoseStatus.STALE, PoseStatus.OK) else status.value

@@ -122,7 +122,7 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
             self.session.simulated_seed = state["simulated_seed"]
         if state["planned"] and bone is not None:
             ultrasound.planProtocol()
-            ultrasound._goTo(int(state.get("asked_for", 0)))
+            ultrasound.goTo(int(state.get("asked_for", 0)))
         if take is not None:
             take()
         self.session.restore_registration(state)

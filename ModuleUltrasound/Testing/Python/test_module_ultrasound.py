@@ -160,7 +160,7 @@ def test_a_recording_holds_every_line_with_its_pose_and_point(a_logic, a_head, t
     run_for(a_logic, 0.4)
     a_logic.nextPoint()
     run_for(a_logic, 0.4)
-    a_logic._closeRecording()
+    a_logic.closeRecording()
     recording = read_recording(tmp_path / "r.igs.mha")
     assert len(recording) > 20
     assert set(recording.palpation_points.tolist()) == {0, 1}
@@ -176,7 +176,7 @@ def test_lines_of_a_lost_probe_are_recorded_without_a_pose(a_logic, tmp_path):
     a_logic.startRecording()
     run_for(a_logic, 0.2)
     run_for(a_logic, 0.5, pose=None, status="MISSING")
-    a_logic._closeRecording()
+    a_logic.closeRecording()
     recording = read_recording(tmp_path / "r.igs.mha")
     assert recording.statuses[-1] == "MISSING"
     assert np.isnan(recording.probe_to_reference[-1]).all()
@@ -251,8 +251,8 @@ def test_a_probe_far_from_the_point_takes_nothing_and_is_told_so(a_recording_log
 
 def test_guidance_tells_the_tilt_under_the_registration(a_recording_logic):
     logic = a_recording_logic
-    logic._closeRecording()  # guidance needs no recording, and without one no point is taken
-    logic._goTo(5)
+    logic.closeRecording()  # guidance needs no recording, and without one no point is taken
+    logic.goTo(5)
     run_for(logic, 0.6, on_point(logic, 5))
     assert float(logic.tilt().text) < 2.0
     assert logic.guidance().level is Level.GOOD

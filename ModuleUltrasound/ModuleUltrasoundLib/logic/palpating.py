@@ -1,0 +1,173 @@
+"""The palpation step: lines are recorded, and points taken on which the probe rests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Optional
+
+import numpy as np
+from CranioNavLib import scene, scene_data
+from CranioNavLib.files import set_aside
+from CranioNavLib.module_logic import done_or
+from CranioNavLib.panel import Reading, StepState, StepStatus, Task
+from CranioNavLib.rigid import invert_rigid, transform_points
+
+from ModuleUltrasoundLib.line_stream import PosedLine
+from ModuleUltrasoundLib.logic.measuring import MeasureStep
+from ModuleUltrasoundLib.logic.planning import count_of, registered
+from ModuleUltrasoundLib.logic.probing import ProbeStep
+
+if TYPE_CHECKING:
+    from ModuleUltrasoundLib.line_recorder import LineRecorder
+    from ModuleUltrasoundLib.palpation import Palpation, PalpationStatus
+
+
+class PalpationStep(ProbeStep, MeasureStep):
+    """Recording, and SurfacePoints as they are taken."""
+
+    def __init__(self, parent: Any = None) -> None:
+        super().__init__(parent)
+        self.recorder: Optional[LineRecorder] = None
+        self._palpation: Optional[Palpation] = None  # which points have been taken, while recording
+        self._palpated: Optional[PalpationStatus] = None  # its last status
+        self._fedTime = 0.0  # time of the last line that palpation was given
+
+    def goTo(self, index: int) -> None:
+        """Ask for a point; where it is expected on the patient follows from the registration, once there is one."""
+        super().goTo(index)
+        points = scene.find("ProtocolPoints")
+        if self._palpation is None or index < 0 or points is None:
+            return
+        expected = None
+        if registered():
+            target = np.array(points.GetNthControlPointPosition(index))[None]
+            expected = transform_points(invert_rigid(scene_data.get_transform("ReferenceToRas")), target)[0]
+        self._palpation.aim(index, expected)
+
+    def disconnect(self) -> None:
+        """Let go of the device; a recording under way is finished."""
+        if self.recorder is not None:
+            self.closeRecording()
+        super().disconnect()
+        self._palpation = None
+
+    # Recording
+
+    def startRecording(self) -> str:
+        """Record every line with its pose into `recording_path`; points of the protocol are taken by resting on them."""
+        from ModuleUltrasoundLib.line_recorder import LineRecorder
+        from ModuleUltrasoundLib.palpation import Palpation
+
+        path = self.parameters().read().recording_path
+        earlier = set_aside(path)
+        first = self.latest[-1].line
+        self.recorder = LineRecorder(path, first, self.running.acquisition)
+        if count_of("ProtocolPoints"):
+            self._palpation, self._fedTime = Palpation(scene_data.get_points("ProtocolPoints").labels), first.host_time_s
+            self.goTo(self.currentIndex())
+        return f"recording into {path}" + (f"; the one before is kept as {earlier.name}" if earlier is not None else "")
+
+    def startRecordingBlocked(self) -> str:
+        """Why nothing can be recorded now."""
+        if self.recorder is not None:
+            return "already recording"
+        if not self.latest:
+            return self.notConnected() or "no line has come yet"
+        return "" if self.parameters().read().recording_path else "choose a file first"
+
+    def record(self, posed: list[PosedLine]) -> None:
+        """Lines into the file, while there is a recording."""
+        if self.recorder is not None:
+            for item in posed:
+                self.recorder.add(item)
+
+    def stopRecording(self) -> Task:
+        """Finish the file and measure it."""
+        self.closeRecording()
+        return self.measureRecording()
+
+    def stopRecordingBlocked(self) -> str:
+        """Why there is no recording to stop."""
+        return "" if self.recorder is not None else "not recording"
+
+    def closeRecording(self) -> None:
+        """Write what waits for its pose and finish the file; no more points are taken."""
+        if self.recorder is not None:
+            self.record(self.poser.ready(everything=True) if self.poser is not None else [])
+            self.recorder.close()
+        self.recorder = self._palpation = self._palpated = None
+
+    def measureRecordingBlocked(self) -> str:
+        """Why nothing can be measured now."""
+        return "stop the recording first" if self.recorder is not None else super().measureRecordingBlocked()
+
+    # Points
+
+    def takePoints(self) -> None:
+        """A point on which the probe has rested long enough is taken, and the next one is asked for."""
+        from ModuleUltrasoundLib.palpation import lines_of
+
+        if self._palpation is None or self.measured is None:
+            return
+        new = False
+        for line in lines_of(self.measured, [item.line.host_time_s for item in self.latest]):
+            if line.time_s <= self._fedTime:
+                continue
+            self._fedTime = line.time_s
+            self._palpated = self._palpation.add(line)
+            if self._palpated.new_point is not None:
+                new = True
+                if self._palpated.target is not None:
+                    self.goTo(self._palpated.target)
+        if new:
+            self._showTaken(self._palpation)
+
+    def _showTaken(self, palpation: Palpation) -> None:
+        """The points taken so far as SurfacePoints; measuring the whole recording replaces them at the end."""
+        from ModuleUltrasoundLib.palpation import to_bone_points
+
+        taken, wanted = palpation.taken, self.parameters().read()
+        if not taken:
+            scene.release("SurfacePoints")
+            return
+        lines, labels = [point.line for point in taken], [point.label for point in taken]
+        scene_data.set_bone_points(to_bone_points(lines, labels, wanted.speed_of_sound_m_s, wanted.speed_of_sound_sd_m_s))
+
+    def undoPoint(self) -> Optional[str]:
+        """Take back the last point and return to it. Returns a message."""
+        point = self._palpation.undo() if self._palpation is not None else None
+        if point is None or self._palpation is None:
+            return None
+        self.goTo(point.target)
+        self._showTaken(self._palpation)
+        return f"{point.label} taken back"
+
+    def undoPointBlocked(self) -> str:
+        """Why there is no point to take back."""
+        return "" if self.taken() else "no point has been taken in this recording"
+
+    def taken(self) -> list[str]:
+        """Labels of the points taken in this recording."""
+        return [point.label for point in self._palpation.taken] if self._palpation is not None else []
+
+    # What the panel shows
+
+    def dwell(self) -> Optional[Reading]:
+        """How many points are taken, and what the present one still lacks."""
+        if self._palpated is None:
+            return None
+        done = f"{self._palpated.taken} of {self._palpated.total} points; rested {self._palpated.dwell:.0%} of the time needed"
+        return Reading("; ".join(filter(None, [done, self._palpated.reason])))
+
+    def recorded(self) -> Optional[Reading]:
+        """How much has been recorded."""
+        if self.recorder is None:
+            return None
+        return Reading(f"{self.recorder.lines} lines at {len(self.recorder.points)} points")
+
+    def palpationStatus(self) -> StepStatus:
+        """Whether something is being or has been recorded."""
+        if self.recorder is not None:
+            return StepStatus(StepState.ATTENTION, "recording; stop when all points are palpated")
+        done = Path(self.parameters().read().recording_path).is_file()
+        return done_or(done, self.startRecordingBlocked() or "record")

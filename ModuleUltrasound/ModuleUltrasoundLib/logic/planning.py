@@ -1,0 +1,111 @@
+"""The protocol step: which points are palpated, and which of them now."""
+
+from __future__ import annotations
+
+from typing import Optional
+
+import numpy as np
+from CranioNavLib import scene, scene_data
+from CranioNavLib.errors import InputError
+from CranioNavLib.module_logic import DeviceInScene, done_or
+from CranioNavLib.panel import Reading, StepStatus
+from CranioNavLib.rigid import Array
+from CranioNavLib.slicer_files import LabelledPoints
+
+from ModuleUltrasoundLib.device import DeviceError
+from ModuleUltrasoundLib.line_stream import LineStream
+from ModuleUltrasoundLib.panel_description import UltrasoundParameters
+
+CURRENT_POINT = "current"  # parameter of the Protocol node: index of the point to palpate now
+NORMALS = ("Normal_R", "Normal_A", "Normal_S")  # measurements of ProtocolPoints: outward normals of the bone
+
+
+class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
+    """ProtocolPoints and Protocol; what every other step stands on."""
+
+    parameterClass = UltrasoundParameters
+    sessionRole = "UltrasoundSession"
+    refusals = (DeviceError,)
+    deviceWord = "device"
+
+    def planProtocol(self) -> str:
+        """Place the palpation points on the outer table; writes ProtocolPoints and Protocol. Returns a message."""
+        from ModuleUltrasoundLib.protocol import plan_protocol
+
+        landmarks = scene_data.get_points("LandmarksCT") if count_of("LandmarksCT") else None
+        planned = plan_protocol(
+            scene_data.get_surface("OuterTable"),
+            landmarks.positions_mm if landmarks else None,
+            landmarks.labels if landmarks else None,
+        )
+        node = scene_data.set_points("ProtocolPoints", LabelledPoints(planned.labels, planned.positions_ras_mm))
+        for axis, name in enumerate(NORMALS):
+            scene_data.add_measurement(node, name, planned.normals[:, axis])
+        self.goTo(0)
+        missing = f"; no bone to stand on for {', '.join(planned.left_out)}" if planned.left_out else ""
+        return f"{len(planned.labels)} points{missing}"
+
+    def planProtocolBlocked(self) -> str:
+        """Why no points can be placed now."""
+        return "" if scene.find("OuterTable") is not None else "find the bone in the registration module first"
+
+    def protocolPoints(self) -> tuple[Array, Array, tuple[str, ...]]:
+        """Positions (N, 3) in RAS, outward normals (N, 3) and labels of the planned points.
+
+        Raises
+        ------
+        InputError
+            Somebody added or removed points by hand, so that normals are lacking.
+        """
+        points = scene_data.get_points("ProtocolPoints")
+        columns = scene_data.read_measurements(scene.find("ProtocolPoints"))
+        if not all(name in columns and len(columns[name]) == len(points) for name in NORMALS):
+            raise InputError("the palpation points were edited by hand and have no normals any more; plan them again")
+        return points.positions_mm, np.stack([columns[name] for name in NORMALS], axis=1), points.labels
+
+    def nextPoint(self) -> None:
+        """Go on to the next point of the protocol; the present one may be taken later."""
+        self.goTo(min(self.currentIndex() + 1, count_of("ProtocolPoints") - 1))
+
+    def nextPointBlocked(self) -> str:
+        """Why there is no next point."""
+        return "" if count_of("ProtocolPoints") else "plan the points first"
+
+    def previousPoint(self) -> None:
+        """Go back to the point before."""
+        self.goTo(max(self.currentIndex() - 1, 0))
+
+    def previousPointBlocked(self) -> str:
+        """Why there is no point before."""
+        return self.nextPointBlocked()
+
+    def currentIndex(self) -> int:
+        """Index of the point to palpate now; -1 without a protocol."""
+        node = scene.find("Protocol")
+        text = node.GetParameter(CURRENT_POINT) if node is not None else ""
+        return int(text) if text and count_of("ProtocolPoints") else -1
+
+    def goTo(self, index: int) -> None:
+        """Ask for a point."""
+        scene.find_or_create("Protocol").SetParameter(CURRENT_POINT, str(index))
+
+    def currentPoint(self) -> Optional[Reading]:
+        """The point to palpate now."""
+        index, node = self.currentIndex(), scene.find("ProtocolPoints")
+        return Reading(f"{index + 1}. {node.GetNthControlPointLabel(index)}") if index >= 0 and node is not None else None
+
+    def protocolStatus(self) -> StepStatus:
+        """Whether the points are planned."""
+        return done_or(count_of("ProtocolPoints") > 0, self.planProtocolBlocked() or "plan the points")
+
+
+def count_of(role: str) -> int:
+    """How many points a role has."""
+    node = scene.find(role)
+    return int(node.GetNumberOfControlPoints()) if node is not None else 0
+
+
+def registered() -> bool:
+    """Whether ReferenceToRas is a registration."""
+    node = scene.find("ReferenceToRas")
+    return node is not None and bool(node.GetAttribute(scene.STATUS_ATTRIBUTE))

@@ -1,0 +1,175 @@
+"""The probe step: lines with the probe's pose, what the last of them say of the depth, where the probe has to go."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any, Optional
+
+import numpy as np
+import numpy.typing as npt
+from CranioNavLib import scene, scene_data
+from CranioNavLib.errors import InputError
+from CranioNavLib.panel import Level, Reading, StepStatus
+
+from ModuleUltrasoundLib.line_stream import LinePoser, LineStream, PosedLine
+from ModuleUltrasoundLib.logic.planning import ProtocolStep, registered
+
+if TYPE_CHECKING:
+    from CranioNavLib.surface import Surface
+
+    from ModuleUltrasoundLib.guidance import Guide
+    from ModuleUltrasoundLib.measure import LineMeasurements
+
+LIVE_LINES = 12  # that the live depth is read from: a third of a second at 40 lines a second
+LIVE_EVERY_S = 0.2
+
+
+class ProbeStep(ProtocolStep):
+    """Live lines and guidance."""
+
+    def __init__(self, parent: Any = None) -> None:
+        super().__init__(parent)
+        self.latest: list[PosedLine] = []  # the last ones
+        self.measured: Optional[LineMeasurements] = None  # what they say
+        self.poser: Optional[LinePoser] = None
+        self._observation: Optional[scene.Observation] = None
+        self._measuredTime = 0.0
+        self._guide: Optional[Guide] = None  # where the probe stands to the current point
+        self._surface: tuple[int, Optional[Surface]] = (0, None)  # time stamp of the mesh; its index is worth keeping
+
+    def connect(self) -> str:
+        """Begin to take lines from the device that the parameters name. Returns a message."""
+        device = self.createPlugin("amode", self.parameters().read().device)
+        self.failure, self.poser = "", LinePoser()
+        self._observation = scene.observe("ProbeToReference", self._takePose)
+        self.stream = LineStream(device)
+        self.stream.start()
+        return f"connecting to {device.title}"
+
+    def disconnect(self) -> None:
+        """Let go of the device."""
+        if self._observation is not None:
+            self._observation.stop()
+        if self.stream is not None:
+            self.stream.stop()
+        self.stream = self.poser = self._observation = self.measured = self._guide = None
+        self.latest = []
+
+    def takeLines(self) -> list[PosedLine]:
+        """The lines whose pose is known by now, since the last call.
+
+        Raises
+        ------
+        InputError
+            The device refuses its settings; it is let go of.
+        """
+        try:
+            lines = self.running.poll()
+        except InputError as error:
+            self.disconnect()
+            self.failure = str(error)
+            raise
+        assert self.poser is not None  # there is one while there is a stream
+        for line in lines:
+            self.poser.add_line(line, self.currentIndex())
+        posed = self.poser.ready()
+        self.latest = (self.latest + posed)[-LIVE_LINES:]
+        return posed
+
+    def _takePose(self, node: Any) -> None:
+        pose = scene_data.get_pose("ProbeToReference")
+        if pose.host_time_s == pose.host_time_s and self.poser is not None:
+            self.poser.add_pose(pose.matrix, pose.status, pose.host_time_s)
+
+    def measureLive(self) -> bool:
+        """A few times a second: the last line as a table, and what the last lines say; whether it was time for it."""
+        from ModuleUltrasoundLib.line_stream import recording_of
+        from ModuleUltrasoundLib.measure import measure_lines
+
+        now = time.monotonic()
+        if not self.latest or now < self._measuredTime + LIVE_EVERY_S:
+            return False
+        self._measuredTime = now
+        acquisition, samples = self.running.acquisition, self.latest[-1].line.samples
+        times = 1e6 / acquisition.sampling_hz * np.arange(len(samples))
+        scene_data.set_table("ALine", {"time (µs)": times.tolist(), "amplitude": samples.tolist()})
+        self.measured = measure_lines(recording_of(self.latest, acquisition), self.parameters().read().echo_settings())
+        return True
+
+    def steer(self) -> None:
+        """Where the probe stands to the current point, under the registration in force."""
+        from ModuleUltrasoundLib.guidance import guide
+
+        index, pose = self.currentIndex(), scene_data.get_pose("ProbeToReference")
+        table = scene.find("OuterTable")
+        self._guide = None
+        if index < 0 or pose.matrix is None or not registered() or table is None:
+            return
+        positions, normals, _ = self.protocolPoints()
+        probe_to_ras = scene_data.get_transform("ReferenceToRas") @ pose.matrix
+        self._guide = guide(probe_to_ras, self._surfaceOf(table), positions[index], normals[index])
+
+    def _surfaceOf(self, table: Any) -> Surface:
+        stamp, surface = self._surface
+        if surface is None or stamp != table.GetPolyData().GetMTime():
+            surface = scene_data.get_surface("OuterTable")
+            self._surface = (table.GetPolyData().GetMTime(), surface)
+        return surface
+
+    # What the panel shows
+
+    def live(self) -> Optional[tuple[npt.NDArray[np.int16], float, LineMeasurements]]:
+        """For a drawing of the last line: its samples, rate in Hz, and what was measured; None without one."""
+        if not self.latest or self.measured is None or not len(self.measured):
+            return None
+        return self.latest[-1].line.samples, self.running.acquisition.sampling_hz, self.measured
+
+    def guide(self) -> Optional[Guide]:
+        """Where the probe stands to the current point; None without a registration or a live probe."""
+        return self._guide
+
+    def connection(self) -> Reading:
+        """Connected, or why not."""
+        if self.stream is None:
+            return self.whyNoConnection()
+        state = self.stream.state
+        return Reading(state.problem or f"{state.lines} lines", Level.GOOD if state.connected else Level.WARNING)
+
+    def probePose(self) -> Reading:
+        """Whether the scene has a live pose of the probe."""
+        status = scene_data.get_pose("ProbeToReference").status
+        return Reading("in view", Level.GOOD) if status == "OK" else Reading(f"not in view ({status.lower()})", Level.BAD)
+
+    def depth(self) -> Optional[Reading]:
+        """The bone's depth under the probe now; None while there is no trustworthy echo."""
+        from ModuleUltrasoundLib.quality import reason_in_words
+
+        if self.measured is None or not len(self.measured):
+            return None
+        if not self.measured.accepted[-1]:
+            return Reading(reason_in_words(self.measured.reasons[-1]), Level.WARNING)
+        return Reading(f"{self.measured.depths_mm[-1]:.1f}", Level.GOOD)
+
+    def quality(self) -> Optional[Reading]:
+        """Probability that the depth is right to half a millimetre."""
+        if self.measured is None or not len(self.measured):
+            return None
+        value = float(self.measured.qualities[-1])
+        good = value >= self.parameters().read().quality_gate
+        return Reading(f"{value:.2f}", Level.GOOD if good else Level.WARNING)
+
+    def guidance(self) -> Optional[Reading]:
+        """What to do with the probe now."""
+        if self._guide is None:
+            return None
+        return Reading(self._guide.instruction, Level.GOOD if self._guide.on_target and self._guide.aligned else Level.WARNING)
+
+    def tilt(self) -> Optional[Reading]:
+        """Angle between the beam and the bone's normal."""
+        if self._guide is None:
+            return None
+        return Reading(f"{self._guide.angle_deg:.0f}", Level.GOOD if self._guide.aligned else Level.WARNING)
+
+    def deviceStatus(self) -> StepStatus:
+        """Whether lines arrive."""
+        return self.statusOfDevice()
