@@ -14,12 +14,12 @@ from CranioNavLib.parameters import Limits, Parameters
 from ModuleTrackingLib.ndi.conductor import Conductor, SystemClock
 from ModuleTrackingLib.ndi.plan import Plan, read_pairs, read_tool_files
 from ModuleTrackingLib.ndi.poll import Counts, Poller
+from ModuleTrackingLib.ndi.port_search import find_port
 from ModuleTrackingLib.ndi.poses import missing_poses, tool_poses
 from ModuleTrackingLib.ndi.replies import BadReplyError, DeviceError, parse_parameters
 from ModuleTrackingLib.ndi.serial_port import list_ports, open_port, same_device, tcp_address
 from ModuleTrackingLib.ndi.session import Session, SetUpError
 from ModuleTrackingLib.ndi.steps import Ask, Clock, Connect, Disconnect, LinkError, Pause, Port, PortLostError, Script
-from ModuleTrackingLib.ndi.talk import PROBE, PROBE_S
 from ModuleTrackingLib.ndi.words import DIAGNOSTIC_PENDING
 from ModuleTrackingLib.tracker import ToolInfo, ToolPose, Tracker, TrackerError
 
@@ -344,29 +344,11 @@ class PolarisTracker(Tracker):
             self.on_state(state, message)
 
     def _find_port(self) -> str:
-        """The first likely port whose device answers; nothing but a harmless question is sent."""
-        tried = []
-        for choice in list_ports():
-            if choice.rank > 1:
-                continue
-            tried.append(f"{choice.device} ({choice.hint})")
-            conductor = Conductor(lambda device=choice.device: self.open_port(device), self.clock)  # type: ignore[misc]
-            try:
-                conductor.begin(_knock())
-                if conductor.advance(self.clock.now() + 2.0):
-                    return choice.device
-            except (LinkError, BadReplyError):
-                continue
-            except DeviceError:
-                return choice.device
-            finally:
-                conductor.drop()
-                conductor.close_port()
-        self._go(PolarisState.DISCONNECTED, "no tracker found")
-        raise TrackerError(
-            f"no tracker answered; asked: {', '.join(tried) or 'no port, for there is none of the likely kind'}. "
-            "Switch it on, plug it in, or name its port: a tracker left at another speed is only found by name"
-        )
+        try:
+            return find_port(self.open_port, self.clock)
+        except TrackerError:
+            self._go(PolarisState.DISCONNECTED, "no tracker found")
+            raise
 
 
 _MENDING = (PolarisState.LOST, PolarisState.CONNECTING, PolarisState.SETTING_UP)
@@ -375,11 +357,6 @@ _MODE_ERRORS = frozenset({0x0C, 0x10, 0x05, 0x2C})
 
 def _try_port() -> Script[None]:
     yield Connect()
-
-
-def _knock() -> Script[None]:
-    yield Connect()
-    yield Ask(PROBE, PROBE_S)
 
 
 def _get(name: str) -> Script[dict[str, str]]:
