@@ -1,131 +1,22 @@
-"""The tracking module's logic on the real scene, with a tracker that does exactly what the test says."""
+"""The tracking module's logic on the real scene: poses, points, recording, sharing."""
 
 from __future__ import annotations
 
 import time
 from contextlib import closing
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from CranioNavLib import host, scene, scene_data
+from CranioNavLib import scene, scene_data
 from CranioNavLib.errors import InputError
 from CranioNavLib.openigtlink import IgtlClient
 from CranioNavLib.openigtlink.messages import Transform
 from CranioNavLib.panel import Level, StepState
-from CranioNavLib.parameters import Parameters
-from CranioNavLib.rigid import invert_rigid, rigid, rigid_from_vector
+from CranioNavLib.rigid import invert_rigid, rigid
 from CranioNavLib.sequence_metafile import read_recording
 from CranioNavLib.slicer_files import LabelledPoints
 from ModuleTrackingLib.panel_description import PointList, Tool
-from ModuleTrackingLib.tracker import TRACKERS, PoseStatus, ToolInfo, ToolPose, Tracker, TrackerError
-
-import ModuleTracking as module
-
-BASE = rigid_from_vector([0.2, -0.1, 0.4], [30, -40, 1500])  # ReferenceToTracker
-TIP = np.array([1.0, -2.0, 120.0])  # of the stylus, in its marker's frame
-DIVOT = np.array([40.0, 25.0, 10.0])  # in Reference
-
-
-class Script:
-    """What the scripted tracker sees; shared by test and plugin."""
-
-    refuse = ""
-    broken = False
-    silent: tuple = ()  # tools that the tracker says nothing of, not even that they are missing
-    tools: dict = {}  # tool -> ToolToReference, or a function of the frame's number  # noqa: RUF012
-
-
-@TRACKERS.register
-class ScriptedTracker(Tracker):
-    name = "scripted"
-    title = "Scripted"
-
-    @dataclass(frozen=True)
-    class Settings(Parameters):
-        pass
-
-    def open(self):
-        if Script.refuse:
-            raise InputError(Script.refuse)
-        self.frame = 0
-
-    def start(self):
-        pass
-
-    def stop(self):
-        pass
-
-    def close(self):
-        pass
-
-    @property
-    def tools(self):
-        return [ToolInfo(name) for name in ("Reference", "Stylus", "Probe")]
-
-    def read(self, timeout_s=1.0):
-        time.sleep(0.004)
-        if Script.broken:
-            raise TrackerError("the cable fell out; plug it in")
-        self.frame += 1
-        now = time.monotonic()
-        poses = [ToolPose("Reference", BASE, PoseStatus.OK, now, frame_number=self.frame)]
-        if "Reference" in Script.silent:
-            return []
-        for name in {"Stylus", "Probe"}.difference(Script.silent):
-            pose = Script.tools.get(name)
-            pose = pose(self.frame) if callable(pose) else pose
-            status = PoseStatus.OK if pose is not None else PoseStatus.MISSING
-            poses.append(ToolPose(name, None if pose is None else BASE @ pose, status, now, frame_number=self.frame))
-        return poses
-
-
-def pivoting(frame):
-    """The stylus' marker while its tip rests in the divot."""
-    turn = rigid_from_vector([0.5 * np.sin(frame / 7), 0.5 * np.sin(frame / 11), 0.3 * np.sin(frame / 5)], np.zeros(3))
-    return rigid(np.eye(3), DIVOT) @ turn @ rigid(np.eye(3), -TIP)
-
-
-@pytest.fixture
-def a_logic():
-    host.scene().Clear(False)
-    Script.silent = ()
-    Script.refuse, Script.broken, Script.tools = "", False, {"Stylus": rigid(np.eye(3), DIVOT)}
-    logic = module.ModuleTrackingLogic()
-    logic.parameters().change(tracker="scripted", rest_s=0.1)
-    yield logic
-    logic.disconnect()
-    host.scene().Clear(False)
-
-
-def run_until(logic, done, limit_s=10.0):
-    end = time.monotonic() + limit_s
-    while time.monotonic() < end:
-        logic.poll()
-        if done():
-            return
-        time.sleep(0.005)
-    raise AssertionError("waited in vain")
-
-
-def seen(tool="Stylus"):
-    return lambda: scene_data.get_pose(f"{tool}ToReference").matrix is not None
-
-
-def run_for(logic, seconds):
-    end = time.monotonic() + seconds
-    run_until(logic, lambda: time.monotonic() > end)
-
-
-def read_point(logic):
-    """Read the resting tip as a user does: try again while it is refused."""
-    for _ in range(40):
-        run_for(logic, 0.25)
-        try:
-            return logic.digitise()
-        except InputError:
-            continue
-    return logic.digitise()
+from obedient_tracker import BASE, DIVOT, Script, read_point, run_for, run_until, seen
 
 
 def test_poses_reach_the_scene_relative_to_the_reference_base(a_logic):
@@ -187,31 +78,6 @@ def test_a_tracker_that_refuses_its_settings_says_so_and_can_be_tried_again(a_lo
     assert "COM9" in a_logic.connection().text
     assert a_logic.trackerStatus().state is StepState.ATTENTION
     assert a_logic.connectBlocked() == ""
-
-
-def test_pivoting_calibrates_the_tip_and_the_scene_shows_it_from_then_on(a_logic):
-    Script.tools = {"Stylus": pivoting}
-    a_logic.connect()
-    run_until(a_logic, seen())
-    a_logic.parameters().change(pivot_s=1.0)
-    a_logic.startPivot()
-    assert a_logic.digitiseBlocked() == "a tool is being calibrated"
-    run_until(a_logic, lambda: "Stylus" in a_logic.calibrator.found)
-    np.testing.assert_allclose(a_logic.calibrator.found["Stylus"].tool_to_marker[:3, 3], TIP, atol=1e-6)
-    run_for(a_logic, 0.1)
-    np.testing.assert_allclose(scene_data.get_transform("StylusToReference")[:3, 3], DIVOT, atol=1e-6)
-    assert a_logic.calibrationStatus().state is StepState.DONE
-
-
-def test_a_tool_held_still_cannot_be_calibrated_and_the_panel_says_why(a_logic):
-    a_logic.connect()
-    run_until(a_logic, seen())
-    a_logic.parameters().change(pivot_s=1.0)
-    a_logic.startPivot()
-    run_until(a_logic, lambda: not a_logic.calibrator.busy)
-    assert "Stylus" not in a_logic.calibrator.found
-    assert "tilt" in a_logic.pivotProgress().text
-    assert a_logic.calibrationStatus().state is StepState.ATTENTION
 
 
 def test_points_get_the_planned_labels_in_order_and_can_be_undone(a_logic):
@@ -296,88 +162,6 @@ def test_after_disconnecting_nothing_is_live(a_logic):
     assert scene_data.get_pose("StylusToReference").matrix is None
     assert a_logic.stylusTool() is None
     assert a_logic.digitiseBlocked() == "connect the tracker first"
-
-
-def still(place):
-    """The stylus' marker while its tip rests there, a little differently in every frame."""
-    return lambda frame: rigid(np.eye(3), np.asarray(place) - TIP + 0.01 * np.sin([frame, 2 * frame, 3 * frame]))
-
-
-def calibrate_stylus(logic):
-    Script.tools = {"Stylus": pivoting}
-    logic.connect()
-    run_until(logic, seen())
-    logic.parameters().change(pivot_s=1.0)
-    logic.startPivot()
-    run_until(logic, lambda: not logic.calibrator.busy)
-    assert "Stylus" in logic.calibrator.found, logic.pivotProgress()
-
-
-def test_a_base_that_moved_on_its_clamp_is_told_by_touching_the_divot_again(a_logic, tmp_path):
-    a_logic.parameters().change(calibration_folder=str(tmp_path))
-    calibrate_stylus(a_logic)
-    assert a_logic.checkBaseBlocked() == "store the check point first"
-    assert "no check point" in a_logic.baseCheck().text
-    Script.tools = {"Stylus": still(DIVOT)}
-    run_for(a_logic, 0.5)
-    a_logic.storeCheckPoint()
-    assert "not checked since" in a_logic.baseCheck().text
-    assert "sits firmly" in a_logic.checkBase()
-    Script.tools = {"Stylus": still(DIVOT + [12.0, 0, 0])}  # seen from a base that slipped by 12 mm
-    run_for(a_logic, 0.5)
-    assert "moved by 12.0 mm" in a_logic.checkBase()
-    assert a_logic.baseCheck().level is a_logic.referenceTool().level is Level.BAD
-    assert a_logic.baseStatus().state is StepState.ATTENTION
-    Script.tools = {"Stylus": still(DIVOT)}
-    run_until(a_logic, lambda: "sits firmly" in a_logic.baseCheck().text)  # nobody pressed anything
-    Script.tools = {"Stylus": still(DIVOT + [0, 3.0, 0])}
-    run_until(a_logic, lambda: "moved by 3.0 mm" in a_logic.baseCheck().text)
-
-
-def test_what_was_calibrated_is_there_again_and_only_for_the_same_tool(a_logic, tmp_path, monkeypatch):
-    a_logic.parameters().change(calibration_folder=str(tmp_path))
-    calibrate_stylus(a_logic)
-    Script.tools = {"Stylus": still(DIVOT)}
-    run_for(a_logic, 0.3)
-    a_logic.storeCheckPoint()
-    a_logic.disconnect()
-    other = module.ModuleTrackingLogic()
-    other.connect()
-    run_until(other, lambda: "Stylus" in other.calibrator.found)
-    run_until(other, lambda: other.base.point is not None)
-    run_for(other, 0.1)
-    np.testing.assert_allclose(scene_data.get_transform("StylusToReference")[:3, 3], DIVOT, atol=0.1)
-    other.disconnect()
-    changed = [ToolInfo(name, definition="another marker") for name in ("Reference", "Stylus", "Probe")]
-    monkeypatch.setattr(ScriptedTracker, "tools", property(lambda self: changed))
-    for logic in (other, module.ModuleTrackingLogic()):  # one that remembers, one that reads the folder
-        logic.connect()
-        run_until(logic, lambda logic=logic: logic._identified)
-        assert "Stylus" not in logic.calibrator.found
-        assert "does not fit" in logic.calibrationStatus().text
-        assert "another reference tool" in logic.baseCheck().text or "belongs to reference tool" in logic.baseCheck().text
-        logic.disconnect()
-
-
-def test_a_rolled_tool_gets_its_axis(a_logic):
-    a_logic.connect()
-    run_until(a_logic, seen())
-    assert a_logic.startSpinBlocked() == "pivot the tool first"
-    a_logic.disconnect()
-    calibrate_stylus(a_logic)
-    axis = np.array([0.6, 0.0, 0.8])
-    turn = lambda frame: rigid_from_vector(axis * frame / 20, np.zeros(3))  # noqa: E731
-    Script.tools = {"Stylus": lambda frame: rigid(np.eye(3), DIVOT) @ turn(frame) @ rigid(np.eye(3), -TIP)}
-    run_for(a_logic, 0.1)
-    a_logic.parameters().change(pivot_s=2.0)
-    a_logic.startSpin()
-    run_until(a_logic, lambda: not a_logic.calibrator.busy)
-    found = a_logic.calibrator.found["Stylus"]
-    assert found.method == "pivot and spin", a_logic.pivotProgress()
-    np.testing.assert_allclose(found.tool_to_marker[:3, 2], axis, atol=1e-6)
-    np.testing.assert_allclose(found.tool_to_marker[:3, 3], TIP, atol=1e-6)
-    run_for(a_logic, 0.1)
-    np.testing.assert_allclose(scene_data.get_transform("StylusToReference")[:3, 3], DIVOT, atol=1e-6)
 
 
 def test_what_is_tracked_and_registered_is_shared_with_openigtlink_clients(a_logic):
