@@ -48,7 +48,7 @@ class TrackingSelfTest(ScenarioWithPatient):
 
     def _findTip(self) -> None:
         """The stylus is pivoted, and its tip found."""
-        from CranioNavLib.phantom import constants
+        from CranioNavLib.phantom.session import TIPS_MM
 
         self.session.pivot("Stylus")
         self.runFor(1.5)
@@ -57,7 +57,7 @@ class TrackingSelfTest(ScenarioWithPatient):
         self.runFor(5.3)
         assert "Stylus" in self.logic.calibrator.found, self.logic.pivotProgress()
         tip = self.logic.calibrator.found["Stylus"].tool_to_marker[:3, 3]
-        error = np.linalg.norm(tip - constants.STYLUS_TIP_MM)
+        error = np.linalg.norm(tip - TIPS_MM["Stylus"])
         assert error < self.TIP_TOLERANCE_MM, f"tip is wrong by {error:.2f} mm"
         self.delayDisplay(f"tip found to {error:.2f} mm")
 

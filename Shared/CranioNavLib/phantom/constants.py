@@ -52,7 +52,6 @@ TRACKER_JITTER_SHARE = 0.35  # [M] of the SD that changes from frame to frame; t
 # [C] orientation: four spheres 35 to 60 mm from the middle of a frame, 0.11 mm sideways error each, sqrt(4) fewer by the
 # fit: 0.11 / (2 * 60) to 0.11 / (2 * 35) = 0.9 to 1.6 mrad; the lower end, as frames for the head are large
 TRACKER_ROTATION_SD_RAD = 0.0009
-TRACKER_RATE_HZ = 20.0  # [S] Vicra 20 Hz; Polaris 20-60 Hz
 REFERENCE_BASE_DISTANCE_MM = (120.0, 220.0)  # [M] reference base on its clamp to the middle of the head
 CAMERA_DISTANCE_MM = (1100.0, 1600.0)  # [M] working volume of a Vicra or Polaris
 TOOL_ORIGIN_OFFSET_MM = 120.0  # [M] marker frame of a tool to its tip: the lever of the orientation error

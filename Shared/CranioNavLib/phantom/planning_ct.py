@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from CranioNavLib.phantom import constants
 from CranioNavLib.phantom.anatomy import AIR_HU
-from CranioNavLib.rigid import Array, invert_rigid, transform_points
+from CranioNavLib.rigid import Array
 from CranioNavLib.volume import Volume
 
 SPHERE_SUBSAMPLES = 4  # an axis, within one voxel
@@ -90,12 +90,3 @@ def _add_sphere(hu: npt.NDArray[np.float32], ijk_to_ras: Array, center_ras_mm: A
     metal = blocks.mean(axis=(1, 3, 5)).astype(np.float32)
     part = (slice(low[2], high[2]), slice(low[1], high[1]), slice(low[0], high[0]))
     hu[part] = metal * constants.TITANIUM_HU + (1 - metal) * np.maximum(hu[part], AIR_HU)
-
-
-def nearest_voxel(volume: Volume, point_ras_mm: Array) -> tuple[int, int, int]:
-    """(k, j, i) of the voxel that holds a point."""
-    spacing: Array = np.linalg.norm(volume.ijk_to_ras[:3, :3], axis=0)
-    frame = volume.ijk_to_ras.copy()
-    frame[:3, :3] /= spacing
-    i, j, k = np.rint(transform_points(invert_rigid(frame), point_ras_mm[None])[0] / spacing).astype(int)
-    return int(k), int(j), int(i)

@@ -46,7 +46,6 @@ def transmitted_pulse() -> Array:
 PULSE = transmitted_pulse()
 PULSE_SPECTRUM = np.fft.rfft(PULSE)[FIRST_BIN : FIRST_BIN + BIN_COUNT].astype(np.complex64)
 PULSE_NORM = float(np.sqrt((PULSE**2).sum()))
-PULSE_PEAK_S = float(TIMES_S[np.argmax(np.abs(PULSE))])
 
 
 @dataclass(frozen=True, eq=False)

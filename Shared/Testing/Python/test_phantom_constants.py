@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[3]
-# the simulated devices, the emulators, and the studies that score estimators against the truth
+# the simulated devices, the emulators, and the studies and self-tests that score estimators against the truth
 MAY_USE_THE_PHANTOM = {
     "ModuleTracking/ModuleTrackingLib/plugins/simulated.py",
     "ModuleUltrasound/ModuleUltrasoundLib/plugins/simulated.py",
@@ -17,6 +17,9 @@ MAY_USE_THE_PHANTOM = {
     "ModuleUltrasound/ModuleUltrasoundLib/emulators/line_source.py",
     "ModuleRegistration/ModuleRegistrationLib/verification/studies.py",
     "ModuleRegistration/ModuleRegistrationLib/verification/study_figure.py",
+    "ModuleTracking/ModuleTrackingLib/selftest.py",
+    "ModuleRegistration/ModuleRegistrationLib/selftest.py",
+    "Shared/CranioNavLib/module_selftest.py",
 }
 LIB_FILES = sorted(path for lib in ROOT.glob("Module*/Module*Lib") for path in lib.rglob("*.py"))
 LIB_FILES += sorted(path for path in (ROOT / "Shared/CranioNavLib").glob("*.py"))

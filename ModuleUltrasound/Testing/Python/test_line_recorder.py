@@ -1,0 +1,33 @@
+"""What is written of lines with and without a pose."""
+
+from __future__ import annotations
+
+import numpy as np
+from CranioNavLib.sequence_metafile import Acquisition, read_recording
+from ModuleTrackingLib.tracker import PoseStatus, ToolPose
+from ModuleUltrasoundLib.device import RfLine
+from ModuleUltrasoundLib.line_recorder import LineRecorder
+from ModuleUltrasoundLib.line_stream import PosedLine
+
+
+def line_at(time_s, value, status=PoseStatus.OK, point=-1):
+    pose = np.eye(4) if status is PoseStatus.OK else None
+    return PosedLine(RfLine(np.full(8, value, np.int16), time_s), ToolPose("Probe", pose, status, time_s), point)
+
+
+def test_lines_are_timed_from_the_first_and_a_lost_pose_says_why(tmp_path):
+    first = line_at(100.0, 1, point=0)
+    recorder = LineRecorder(str(tmp_path / "r.igs.mha"), first.line, Acquisition(50e6, 5e6))
+    recorder.add(first)
+    recorder.add(line_at(99.9, 9))  # from before the recording
+    recorder.add(line_at(100.5, 2, PoseStatus.STALE, 1))
+    recorder.add(line_at(101.0, 3, PoseStatus.OUT_OF_VOLUME, 2))
+    recorder.add(line_at(101.5, 4, point=3))
+    assert (recorder.lines, recorder.points) == (4, {0, 3})
+    recorder.close()
+    recording = read_recording(tmp_path / "r.igs.mha")
+    np.testing.assert_array_equal(recording.lines[:, 0], [1, 2, 3, 4])
+    np.testing.assert_allclose(recording.timestamps_s, [0, 0.5, 1.0, 1.5])
+    assert recording.statuses == ("OK", "MISSING", "OUT_OF_VOLUME", "OK")
+    assert recording.palpation_points.tolist() == [0, 1, 2, 3]
+    assert np.isnan(recording.probe_to_reference[1]).all()
