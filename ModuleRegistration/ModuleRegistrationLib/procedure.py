@@ -25,8 +25,8 @@ from ModuleRegistrationLib.registration.error_theory import PredictedTre, predic
 from ModuleRegistrationLib.registration.landmarks import LandmarkRegistration, register_landmarks
 from ModuleRegistrationLib.registration.pairing import pair_points
 from ModuleRegistrationLib.registration.problem import METHODS, RegistrationProblem, RegistrationResult
-from ModuleRegistrationLib.registration.verdict import ACCEPTED, WARNING, Limits, Verdict, judge
-from ModuleRegistrationLib.verification.confidence import LIMIT_MM, Confidence, assess, touched_points
+from ModuleRegistrationLib.registration.verdict import Limits, Verdict, judge
+from ModuleRegistrationLib.verification.confidence import LIMIT_MM, Confidence, assess, doubted, touched_points
 from ModuleRegistrationLib.verification.plausibility import Plausibility, plausibility
 from ModuleRegistrationLib.verification.tre import TargetErrors, target_errors
 
@@ -42,7 +42,6 @@ USUAL_FLE_MM = {"Ia": 0.7, "Ib": 2.0, "IIa": 3.5, "IIb": 3.5, "III": 3.5}
 # Landmarks alone are a start, not a result to navigate by: their error is told in a warning, and refused only beyond use
 LANDMARKS_ALONE = Limits(refuse_p95_mm=20.0)
 DEFAULT_TARGETS = 12  # spread over the outer table, where a case names no targets
-CONTRADICTED_P = 1e-3  # plausibility points as far off as these make an accepted registration a doubtful one
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,11 +172,7 @@ def _in_view_of(verdict: Verdict, confidence: Confidence, case: Case) -> Verdict
     if case.targets_patient is not None and case.targets_ct is None:
         unused = "targets-patient is not used: there is no targets-ct to compare it with, so no TRE is measured"
         verdict = replace(verdict, messages=(*verdict.messages, unused))
-    touched = confidence.touched
-    if touched is None or touched.p_value >= CONTRADICTED_P:
-        return verdict
-    status = WARNING if verdict.status == ACCEPTED else verdict.status
-    return replace(verdict, status=status, messages=(*verdict.messages, touched.words("the plausibility points")))
+    return doubted(verdict, confidence)
 
 
 def collect_points(case: Case, mode: str) -> tuple[BonePoints, Optional[Ultrasound]]:

@@ -29,8 +29,7 @@ def surface_rows(result: RegistrationResult, verdict: Verdict, predicted: Option
     """What surface registration and its verdict say."""
     rows = {
         names.METHOD: result.method,
-        names.STATUS: verdict.status,
-        names.MESSAGE: "; ".join(verdict.messages),
+        **verdict_rows(verdict),
         names.POINTS_USED: str(int(result.used.sum())),
         names.POINTS_REJECTED: str(int((~result.used).sum())),
         names.SURFACE_RMS: f"{result.surface_rms_mm:.3f}",
@@ -41,6 +40,11 @@ def surface_rows(result: RegistrationResult, verdict: Verdict, predicted: Option
         rows[names.PREDICTED_MEAN] = f"{predicted.mean_mm.mean():.3f}"
         rows[names.PREDICTED_P95] = f"{predicted.p95_mm.max():.3f}"
     return rows
+
+
+def verdict_rows(verdict: Verdict) -> Rows:
+    """The judgement."""
+    return {names.STATUS: verdict.status, names.MESSAGE: "; ".join(verdict.messages)}
 
 
 def verification_rows(checks: Checks) -> Rows:

@@ -52,6 +52,11 @@ def set_registration(matrix: npt.ArrayLike, status: str, values: Mapping[str, st
     scene_data.set_transform("ReferenceToRas", matrix)
 
 
+def set_verdict(status: str) -> None:
+    """What the registration in force is from now on."""
+    scene.find_or_create("ReferenceToRas").SetAttribute(scene.STATUS_ATTRIBUTE, status)
+
+
 def forget_registration() -> None:
     """ReferenceToRas is the identity again, and no registration."""
     node = scene.find("ReferenceToRas")

@@ -42,12 +42,26 @@ class VerifyingSteps(RegisteringSteps):
             errors, distances = checks.errors, checks.distances
             if errors:
                 scene_data.set_table("TargetErrors", {"target": list(labels), "TRE (mm)": errors.errors_mm.tolist()})
-            results.write_rows({**results.rows(), **verification_rows(checks)})
+            results.write_rows({**results.rows(), **verification_rows(checks), **self._judgedAgain(checks)})
             said = [f"TRE {errors.mean_mm:.2f} mm (mean), {errors.max_mm:.2f} mm (largest)"] if errors else []
             said += [f"plausibility {distances.max_mm:.2f} mm (largest)"] if distances else []
             return "; ".join([*said, *checks.confidence.sentences()])
 
         return Task("Verify", check, take)
+
+    def _judgedAgain(self, checks: Checks) -> dict[str, str]:
+        """Rows of the verdict in view of the checks, which the registration in force takes on; none for landmarks alone."""
+        from ModuleRegistrationLib.registration.verdict import Verdict
+        from ModuleRegistrationLib.result_tables import verdict_rows
+        from ModuleRegistrationLib.verification.confidence import doubted
+
+        rows = results.rows()
+        if names.STATUS not in rows or results.status() != rows[names.STATUS]:
+            return {}
+        given = Verdict(rows[names.STATUS], (rows[names.MESSAGE],) if rows[names.MESSAGE] else ())  # of a scene read again
+        verdict = doubted(self.registered.verdict if self.registered else given, checks.confidence)
+        results.set_verdict(verdict.status)
+        return verdict_rows(verdict)
 
     def _toVerify(self) -> tuple[ToVerify, tuple[str, ...]]:
         """What there is to verify with, and the labels of the markers among it."""

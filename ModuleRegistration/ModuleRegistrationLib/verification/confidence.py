@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Optional
 
 import numpy as np
@@ -12,10 +12,12 @@ from scipy import special
 
 from ModuleRegistrationLib.registration.error_theory import probability_below
 from ModuleRegistrationLib.registration.problem import RegistrationProblem, RegistrationResult, SurfaceRegistration
+from ModuleRegistrationLib.registration.verdict import ACCEPTED, WARNING, Verdict
 from ModuleRegistrationLib.verification.held_out import DistanceCheck, LeaveOneOut, check_held_out, leave_one_out
 from ModuleRegistrationLib.verification.plausibility import Plausibility, expected_plausibility
 
 LIMIT_MM = 2.0  # error that the probability is told for unless another is asked for
+CONTRADICTED_P = 1e-3  # plausibility points as far off as these make an accepted registration a doubtful one
 SCALES = 24  # quantiles of the unknown scale of a covariance that the probability is averaged over
 
 
@@ -53,6 +55,15 @@ def probability(below_limit: Array) -> str:
     """The worst target's probability in per cent; more digits than these are not known."""
     worst = float(below_limit.min())
     return "more than 99%" if worst > 0.99 else "less than 1%" if worst < 0.01 else f"{worst:.0%}"
+
+
+def doubted(verdict: Verdict, confidence: Confidence) -> Verdict:
+    """The verdict on a registration, doubted where the plausibility points contradict its stated error."""
+    touched = confidence.touched
+    if touched is None or touched.p_value >= CONTRADICTED_P:
+        return verdict
+    status, words = (WARNING if verdict.status == ACCEPTED else verdict.status), touched.words("the plausibility points")
+    return replace(verdict, status=status, messages=(*(text for text in verdict.messages if text != words), words))
 
 
 def assess(
