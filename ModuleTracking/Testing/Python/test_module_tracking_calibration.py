@@ -12,12 +12,16 @@ from obedient_tracker import DIVOT, TIP, ObedientTracker, Script, pivoting, run_
 import ModuleTracking as module
 
 
+def begin_pivot(logic):
+    logic.connect()
+    run_until(logic, seen())
+    logic.parameters().change(pivot_s=1.0)
+    logic.startPivot()
+
+
 def test_pivoting_calibrates_the_tip_and_the_scene_shows_it_from_then_on(a_logic):
     Script.tools = {"Stylus": pivoting}
-    a_logic.connect()
-    run_until(a_logic, seen())
-    a_logic.parameters().change(pivot_s=1.0)
-    a_logic.startPivot()
+    begin_pivot(a_logic)
     assert a_logic.digitiseBlocked() == "a tool is being calibrated"
     run_until(a_logic, lambda: "Stylus" in a_logic.calibrator.found)
     np.testing.assert_allclose(a_logic.calibrator.found["Stylus"].tool_to_marker[:3, 3], TIP, atol=1e-6)
@@ -27,10 +31,7 @@ def test_pivoting_calibrates_the_tip_and_the_scene_shows_it_from_then_on(a_logic
 
 
 def test_a_tool_held_still_cannot_be_calibrated_and_the_panel_says_why(a_logic):
-    a_logic.connect()
-    run_until(a_logic, seen())
-    a_logic.parameters().change(pivot_s=1.0)
-    a_logic.startPivot()
+    begin_pivot(a_logic)
     run_until(a_logic, lambda: not a_logic.calibrator.busy)
     assert "Stylus" not in a_logic.calibrator.found
     assert "tilt" in a_logic.pivotProgress().text
@@ -39,10 +40,7 @@ def test_a_tool_held_still_cannot_be_calibrated_and_the_panel_says_why(a_logic):
 
 def calibrate_stylus(logic):
     Script.tools = {"Stylus": pivoting}
-    logic.connect()
-    run_until(logic, seen())
-    logic.parameters().change(pivot_s=1.0)
-    logic.startPivot()
+    begin_pivot(logic)
     run_until(logic, lambda: not logic.calibrator.busy)
     assert "Stylus" in logic.calibrator.found, logic.pivotProgress()
 
