@@ -31,6 +31,7 @@ from Workstation.web.session_windows import Windows
 from Workstation.web.sounds import Cues, situation
 from Workstation.web.tool_models import registered
 from Workstation.web.view_controls import ViewControls, layout_grid
+from Workstation.web.view_frame import SliceSliders
 from Workstation.web.views import ViewFollower
 
 POLL_S = 0.02  # a pose waits for half of it on average
@@ -43,26 +44,28 @@ LOG = logging.getLogger(__name__)
 class WorkstationApp(TrameApp):
     """Server side of the page. Everything that touches the scene runs in the event loop's thread."""
 
-    def __init__(self, server: Any = None, folder: Path | None = None, data: Path | None = None) -> None:
+    def __init__(self, server: Any = None, folder: Path | None = None, data: Path | None = None, confined: bool = False) -> None:
         super().__init__(server)
         from trame_slicer import module as slicer_views
 
         self.server.enable_module(slicer_views)
         self.windows = Windows(self.server.state, self._draw_again)
         self.server.add_protocol_to_configure(lambda protocol: protocol.registerLinkProtocol(self.windows))
-        self.pictures = Pictures()
+        self.pictures, self.sliders = Pictures(), SliceSliders()
         with host.quiet(), built_once():
             self._make_views()
         self.runner = BackgroundRunner()
         self.session = SessionFolder(folder or new_folder(), self._parameter_nodes)
-        self.places = Places(self.session, data)
+        self.places = Places(self.session, data, confined)
         self.logics: dict[str, Any] = {}
         self.panels: dict[str, PanelView] = {}
         for panel, logic in _modules(self.session, self.logics, self._go_to):
             self.logics[panel.module] = logic
             key = panel.module.replace("Module", "").lower()
             model = PanelModel(panel, logic, self.runner)
-            self.panels[panel.module] = PanelView(self.server, model, key, self.places.shown, self.places.meant, self._poll)
+            self.panels[panel.module] = PanelView(
+                self.server, model, key, self.places.shown, self.places.meant, self.places.typed, self._poll
+            )
         self._place: tuple[Any, ...] = ()  # that the slices show
         self._in_turn = itertools.cycle(self.panels)  # of panels that are not shown, one at a time is looked at
         self._use_folder()
@@ -100,7 +103,7 @@ class WorkstationApp(TrameApp):
 
         self.slicer = SlicerApp()
         host.adopt_scene(self.slicer.scene, self.slicer.app_logic)
-        register_quiet_factories(self.slicer.view_manager, self.server)
+        register_quiet_factories(self.slicer.view_manager, self.server, self.sliders)
         self.layouts = LayoutManager(self.slicer.scene, self.slicer.view_manager, self.server)
         # the views are made here: made inside the page, their widgets would land between the page's own
         self.layouts.register_layout_dict(layout_grid())
@@ -183,6 +186,7 @@ class WorkstationApp(TrameApp):
         if turn % REFRESH_EVERY == 0:
             with self.server.state as state:
                 self._refresh_views(state)
+                self.sliders.refresh()
                 if state.step in ("devices", "ultrasound"):
                     state.live = drawings(self.logics[ULTRASOUND])
                 state.files = self.logics[SESSION].offered()

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 CROSSHAIR = "vtkHandleRepresentation"
+EDGE = 4  # pixels about what moves, for the width of lines
 NEAR_SHARE = 0.002  # of the farthest distance: how near to the eye a tool is still drawn
 
 
@@ -136,18 +138,40 @@ class MovingPicture:
         self._renderer.ResetCameraClippingRange()
         near, far = camera.GetClippingRange()
         camera.SetClippingRange(max(near, NEAR_SHARE * far), far)
+        left, bottom, right, top = self._frame(width, height)
+        if left >= right or bottom >= top:
+            return
         self._window.SetSize(width, height)
         self._window.Render()
-        self._window.GetRGBACharPixelData(0, 0, width - 1, height - 1, 0, self._pixels)
-        self._window.GetZbufferData(0, 0, width - 1, height - 1, self._depths)
-        pixels = vtk_to_numpy(self._pixels).reshape(height, width, 4)
-        depths = vtk_to_numpy(self._depths).reshape(height, width)
-        rows, columns = np.nonzero(pixels.view(np.uint32)[..., 0])  # the background is 0 in all four
-        before = _before_the_eye(depths[rows, columns], camera) < still.depths[rows, columns]
-        rows, columns = rows[before], columns[before]
+        self._window.GetRGBACharPixelData(left, bottom, right - 1, top - 1, 0, self._pixels)
+        self._window.GetZbufferData(left, bottom, right - 1, top - 1, self._depths)
+        pixels = vtk_to_numpy(self._pixels).reshape(top - bottom, right - left, 4)
+        depths = vtk_to_numpy(self._depths).reshape(top - bottom, right - left)
+        behind, below = still.depths[bottom:top, left:right], picture[bottom:top, left:right]
+        seen = (pixels[..., 3] > 0) & (_before_the_eye(depths, camera) < behind)  # the background's alpha is 0
+        rows, columns = np.nonzero(seen & (pixels[..., 3] < 255))
         share = pixels[rows, columns, 3:].astype(np.float32) / 255.0
-        mixed = share * pixels[rows, columns, :3] + (1.0 - share) * picture[rows, columns]
-        picture[rows, columns] = mixed.astype(np.uint8)
+        mixed = share * pixels[rows, columns, :3] + (1.0 - share) * below[rows, columns]
+        np.copyto(below, pixels[..., :3], where=seen[..., None])
+        below[rows, columns] = mixed.astype(np.uint8)
+
+    def _frame(self, width: int, height: int) -> tuple[int, int, int, int]:
+        """Left, bottom, right, top (without) of the part of the picture in which the moving models lie, pixels."""
+        to_picture = self._renderer.GetActiveCamera().GetCompositeProjectionTransformMatrix(width / height, -1, 1)
+        matrix = np.array([[to_picture.GetElement(row, column) for column in range(4)] for row in (0, 1, 3)])
+        corners = [
+            [*actor.GetUserMatrix().MultiplyPoint((x, y, z, 1.0))]
+            for actor in self._actors.values()
+            if actor.GetVisibility()
+            for x, y, z in product(*np.reshape(actor.GetMapper().GetInput().GetBounds(), (3, 2)))
+        ]
+        across, up, depth = matrix @ np.transpose(corners)
+        if depth.min() <= 0:  # partly behind the eye
+            return 0, 0, width, height
+        places = (np.stack([across, up], axis=1) / depth[:, None] + 1) / 2 * (width, height)
+        low = np.clip(np.floor(places.min(axis=0)) - EDGE, 0, (width, height)).astype(int)
+        high = np.clip(np.ceil(places.max(axis=0)) + EDGE, 0, (width, height)).astype(int)
+        return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 
 def _before_the_eye(depths: npt.NDArray[Any], camera: Any) -> npt.NDArray[np.float32]:

@@ -7,7 +7,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -18,10 +18,10 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonDataModel import vtkImageData
 
 from Workstation.web.pictures import Picture, Pictures, encoded
-from Workstation.web.view_frame import slice_frame, threed_frame
+from Workstation.web.view_frame import SliceSliders, slice_frame, threed_frame
 
 FASTEST_S = 1 / 25  # between two rounds; what is left of the machine is the browser's
-SHARE = 0.8  # of the event loop's time that painting may take while there is always something to paint
+PATIENCE_S = 0.15  # with a view whose last picture is on its way to the screen
 LOG = logging.getLogger(__name__)
 
 
@@ -63,20 +63,29 @@ class Painter:
         next_s = 0.0
         while True:
             self._news.clear()
-            if not self._ready():
-                await self._news.wait()
+            if not self._ready() or self._soon():
+                with suppress(asyncio.TimeoutError):
+                    await asyncio.wait_for(self._news.wait(), PATIENCE_S)
                 continue
             await asyncio.sleep(max(0.0, next_s - time.monotonic()))
             next_s = time.monotonic() + FASTEST_S
             self._attempt(self.before_round)
             for name in self._ready():
-                begun_s = time.monotonic()
                 self._attempt(self._wanted.pop(name).paint)
-                await asyncio.sleep((time.monotonic() - begun_s) * (1 / SHARE - 1))
+                await asyncio.sleep(0)  # whatever has come meanwhile is served now
 
     def _ready(self) -> list[str]:
         """Views that want a picture which could go out at once."""
-        return [name for name, view in self._wanted.items() if not view.encoding and self.pictures.takes(name)]
+        return [name for name, view in self._wanted.items() if self._takes(view)]
+
+    def _takes(self, view: PacedRendering) -> bool:
+        return not view.encoding and self.pictures.takes(view.name)
+
+    def _soon(self) -> bool:
+        """Whether a view that was painted just now will take another picture in a moment: then all are painted together."""
+        now_s = time.monotonic()
+        late = (view for view in self._wanted.values() if now_s < view.painted_s + PATIENCE_S)
+        return any(not self._takes(view) for view in late)
 
     def _attempt(self, what: Callable[[], None]) -> None:
         try:
@@ -107,8 +116,8 @@ class PacedRendering(ScheduledRenderStrategy):  # type: ignore[misc]
 
     def __init__(self, name: str, source: Any, painter: Painter, quality: int) -> None:
         super().__init__()
-        self.source, self.encoding = source, False
-        self._name, self._painter, self._quality = name, painter, quality
+        self.source, self.encoding, self.painted_s = source, False, 0.0
+        self.name, self._painter, self._quality = name, painter, quality
 
     def schedule_render(self) -> None:
         """Ask for a picture."""
@@ -116,11 +125,11 @@ class PacedRendering(ScheduledRenderStrategy):  # type: ignore[misc]
             return
         if not self._painter.moving:
             self.source.forget()
-        self._painter.ask(self._name, self)
+        self._painter.ask(self.name, self)
 
     def paint(self) -> None:
         """Draw, and have the picture encoded and sent. In the event loop."""
-        picture = self._painter.pictures.begun(self._name)
+        picture, self.painted_s = self._painter.pictures.begun(self.name), time.monotonic()
         pixels = self.source.draw()
         self.encoding = True
         work = asyncio.get_running_loop().run_in_executor(self.encoders, encoded, pixels, self._quality)
@@ -141,10 +150,10 @@ def pixels_of(window: Any) -> Any:
     return vtk_to_numpy(image.GetPointData().GetScalars()).reshape(height, width, 3)
 
 
-def register_quiet_factories(view_manager: Any, server: Any) -> None:
+def register_quiet_factories(view_manager: Any, server: Any, sliders: SliceSliders) -> None:
     """Views for the page that do not render while they are made, as nobody looks at them yet."""
     for kind, view_type, controls in (
-        (SliceView, ViewType.SLICE_VIEW, slice_frame),
+        (SliceView, ViewType.SLICE_VIEW, partial(slice_frame, sliders)),
         (ThreeDView, ViewType.THREE_D_VIEW, threed_frame),
     ):
         quiet = partial(kind, scheduled_render_strategy=ScheduledRenderStrategy())

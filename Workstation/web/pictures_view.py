@@ -30,21 +30,25 @@ SCRIPT = f"""
     for (const [area, [number, picture]] of decoded) {{
       const canvas = document.querySelector(`canvas[data-picture="${{area}}"]`);
       if (!canvas) continue;
-      if (canvas.width !== picture.width || canvas.height !== picture.height) {{
-        canvas.width = picture.width;
-        canvas.height = picture.height;
-      }}
+      const width = picture.displayWidth || picture.width, height = picture.displayHeight || picture.height;
+      if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, {{ width, height }});
       canvas.getContext('2d', {{ alpha: false }}).drawImage(picture, 0, 0);
       picture.close();
       decoded.delete(area);
       if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify([area, number]));
     }}
   }};
+  const decode = async (content) => {{
+    if (!window.ImageDecoder) return createImageBitmap(new Blob([content], {{ type: 'image/jpeg' }}));
+    const decoder = new ImageDecoder({{ data: content, type: 'image/jpeg' }});
+    const {{ image }} = await decoder.decode();
+    decoder.close();
+    return image;
+  }};
   const show = async (data) => {{
     const head = new DataView(data), number = head.getUint32(0, true), length = head.getUint8(4);
     const area = utf8.decode(new Uint8Array(data, {HEADER.size}, length));
-    const content = new Blob([new Uint8Array(data, {HEADER.size} + length)], {{ type: 'image/jpeg' }});
-    const picture = await createImageBitmap(content);
+    const picture = await decode(new Uint8Array(data, {HEADER.size} + length));
     if (number <= latest.get(area)) return;
     latest.set(area, number);
     if (decoded.has(area)) decoded.get(area)[1].close();

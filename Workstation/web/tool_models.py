@@ -47,19 +47,36 @@ class ToolModels:
 
 
 class ErrorRing:
-    """A sphere of the 95% error about the tip; the slices cut it in a ring."""
+    """A sphere of the 95% error about the tip; the slices cut it in a ring. It is moved and sized by a transform."""
 
     def __init__(self) -> None:
         self._node: Any = None
+        self._place: Any = None
 
     def nodes(self) -> list[Any]:
         """The ring's node, if there is one."""
         return [self._node] if self._node is not None and self._node.GetScene() is not None else []
 
-    def show(self, tip_ras_mm: Any, radius_mm: float | None) -> None:
-        """Move and size it; without a radius it is hidden."""
+    def _make(self) -> None:
         from vtkmodules.vtkFiltersSources import vtkSphereSource
 
+        source = vtkSphereSource()
+        source.SetRadius(1.0)
+        source.SetThetaResolution(24)
+        source.SetPhiResolution(16)
+        source.Update()
+        self._place = host.scene().AddNewNodeByClass("vtkMRMLLinearTransformNode", "Place of the error ring")
+        self._place.SetSelectable(False)
+        self._place.SetSaveWithScene(False)
+        self._node = moving_model("Error ring", RING)
+        self._node.GetDisplayNode().SetRepresentation(self._node.GetDisplayNode().WireframeRepresentation)
+        self._node.GetDisplayNode().SetVisibility2D(True)
+        self._node.GetDisplayNode().SetSliceIntersectionThickness(3)
+        self._node.SetAndObservePolyData(source.GetOutput())
+        self._node.SetAndObserveTransformNodeID(self._place.GetID())
+
+    def show(self, tip_ras_mm: Any, radius_mm: float | None) -> None:
+        """Move and size it; without a radius it is hidden."""
         if self._node is not None and self._node.GetScene() is None:
             self._node = None
         if radius_mm is None:
@@ -67,18 +84,13 @@ class ErrorRing:
                 self._node.GetDisplayNode().SetVisibility(False)
             return
         if self._node is None:
-            self._node = moving_model("Error ring", RING)
-            self._node.GetDisplayNode().SetRepresentation(self._node.GetDisplayNode().WireframeRepresentation)
-            self._node.GetDisplayNode().SetVisibility2D(True)
-            self._node.GetDisplayNode().SetSliceIntersectionThickness(3)
-        source = vtkSphereSource()
-        source.SetCenter(*(float(value) for value in tip_ras_mm))
-        source.SetRadius(float(radius_mm))
-        source.SetThetaResolution(24)
-        source.SetPhiResolution(16)
-        source.Update()
-        self._node.SetAndObservePolyData(source.GetOutput())
-        self._node.GetDisplayNode().SetVisibility(True)
+            self._make()
+        place = np.diag([radius_mm, radius_mm, radius_mm, 1.0])
+        place[:3, 3] = tip_ras_mm
+        util = host.slicer_package().util
+        self._place.SetMatrixTransformToParent(util.vtkMatrixFromArray(place))
+        if not self._node.GetDisplayNode().GetVisibility():
+            self._node.GetDisplayNode().SetVisibility(True)
 
 
 def moving_model(name: str, color: tuple[float, float, float]) -> Any:
