@@ -60,7 +60,7 @@ class ModuleTrackingLogic(BaseStep, PointsStep, OutletSteps, ScriptedLoadableMod
         self.failure, self._identified = "", False
         self.stream = PoseStream(tracker, {tool: found.tool_to_marker for tool, found in self.calibrator.found.items()})
         self.stream.start()
-        return f"connecting to {tracker.title}"
+        return str(tracker.title)
 
     def disconnect(self):
         """Stop tracking; every tool is missing from now on."""

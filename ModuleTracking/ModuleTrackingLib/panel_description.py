@@ -51,11 +51,11 @@ PANEL = Panel(
         Step(
             name="tracker",
             title="Tracker",
-            help="Choose the tracker and connect. Every tool is shown live; a lost one is never shown where it was.",
+            help="Choose the tracker and connect. A tool that the camera does not see is not shown.",
             items=(
                 PluginField("tracker", "Tracker", TRACKERS.kind),
-                Action("connect", "Connect", "Open the tracker and begin tracking", primary=True),
-                Action("disconnect", "Disconnect", "Stop tracking and let go of the tracker"),
+                Action("connect", "Connect the tracker", "Open the tracker and begin tracking", primary=True),
+                Action("disconnect", "Disconnect the tracker", "Stop tracking and let go of the tracker"),
                 ReadOut("connection", "Connection"),
                 ReadOut("referenceTool", "Reference base"),
                 ReadOut("probeTool", "Probe"),
@@ -67,7 +67,7 @@ PANEL = Panel(
         Step(
             name="calibration",
             title="Calibration",
-            help="Set the tip into a divot that does not move and pivot the tool by 30° to all sides. "
+            help="Set the tip into a divot (a small hollow) that does not move, and tilt the tool by 30° to all sides. "
             "To know its axis too, roll it about itself afterwards.",
             items=(
                 ReadOut("pivotAdvice", "Do now", large=True),
@@ -86,11 +86,11 @@ PANEL = Panel(
         Step(
             name="base",
             title="Reference base",
-            help="Rest the calibrated stylus in the divot on the head clamp and store the place. "
+            help="If wanted: rest the calibrated stylus in the divot on the head clamp and store the place. "
             "Touch it again at any time: a base that has moved on its clamp is noticed.",
             items=(
-                Action("storeCheckPoint", "Store", "Keep where the divot is now", primary=True),
-                Action("checkBase", "Check", "Compare the divot with the place that is stored"),
+                Action("storeCheckPoint", "Store the check point", "Keep where the divot is now", primary=True),
+                Action("checkBase", "Check the base", "Compare the divot with the place that is stored"),
                 ReadOut("baseCheck", "Base"),
             ),
             status="baseStatus",

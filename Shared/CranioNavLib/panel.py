@@ -14,7 +14,8 @@ FileField      the same, for a `str` parameter that holds a path
 PluginField    the same, for a `str` parameter that holds a plugin's name; the plugin's own settings are shown below it
 ListField      the same, for a `str` parameter that names one of the entries that a method of the logic lists
 NodeField      a role of the scene; the user may let another node of the same class play it
-Action         a method of the logic without arguments. It returns None, a message (str), or a `Task` for long work
+Action         a method of the logic without arguments. It returns None, a message (str, or a `Reading` if it is no good
+               news), or a `Task` for long work
 ReadOut        a method of the logic that returns a `Reading`, or None while there is nothing to show
 Picture        a method of the logic that returns a drawing as SVG text, or None while there is nothing to show
 Step.status    a method of the logic that returns a `StepStatus`
@@ -71,6 +72,7 @@ class StepStatus:
 
     state: StepState
     text: str = ""
+    action: str = ""  # what to press next; "": the step's first main action that can be used
 
 
 @dataclass(frozen=True)
@@ -252,9 +254,9 @@ class Task:
 
     title: str
     compute: Callable[[Progress], Any]
-    apply: Callable[[Any], Union[str, None]]  # given what compute returned; returns a message or None
+    apply: Callable[[Any], Union[str, Reading, None]]  # given what compute returned; returns a message or None
 
-    def run(self, progress: Progress | None = None) -> str | None:
+    def run(self, progress: Progress | None = None) -> str | Reading | None:
         """Both parts, here and now: for scripts and tests."""
         return self.apply(self.compute(progress or Progress()))
 

@@ -187,6 +187,15 @@ class PanelModel:
         except self._refusals as error:
             return StepStatus(StepState.ATTENTION, str(error))
 
+    def offered(self, step: Step) -> Action | None:
+        """What to press next in a step; None if it is done, or nothing can be pressed now."""
+        status = self.status(step)
+        if status.state is StepState.DONE:
+            return None
+        actions = [item for item in step.items if isinstance(item, Action)]
+        wanted = [one for one in actions if (one.name == status.action if status.action else one.primary)]
+        return next((one for one in wanted if not self.blocked(one)), None)
+
     # Listeners
 
     def listen(self, callback: Callable[[], None]) -> None:
@@ -240,11 +249,11 @@ class PanelModel:
         self.message = Message("", Level.PLAIN)
         result = getattr(self.logic, action.name)()
         if not isinstance(result, Task):
-            self._say(result or "", Level.GOOD)
+            self._report(result)
             return
         self.progress = progress = Progress()
         if self.runner is None:
-            self._say(result.run(progress) or "", Level.GOOD)
+            self._report(result.run(progress))
             return
         self.busy = action
         self.runner.start(lambda: result.compute(progress), lambda outcome: self._finish(result, outcome, progress))
@@ -259,13 +268,18 @@ class PanelModel:
         def bring_in() -> None:
             if isinstance(outcome, BaseException):
                 raise outcome
-            self._say(task.apply(outcome) or "", Level.GOOD)
+            self._report(task.apply(outcome))
 
         try:
             self._guarded(bring_in)
         except Exception as error:
             LOG.exception("%s failed", task.title)
             self._say(f"{task.title} failed: {type(error).__name__}: {error}; this is a defect, please report it", Level.BAD)
+
+    def _report(self, said: str | Reading | None) -> None:
+        """What an action returned: good news, unless it says otherwise."""
+        reading = said if isinstance(said, Reading) else Reading(said or "", Level.GOOD)
+        self._say(reading.text, reading.level)
 
     def _say(self, text: str, level: Level) -> None:
         self.message = Message(text, level if text else Level.PLAIN)

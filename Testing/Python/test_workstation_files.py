@@ -187,3 +187,20 @@ def test_a_ct_is_chosen_by_series_or_sent_and_the_page_tells_no_path(tmp_path):
         for secret in (str(tmp_path), str(Path.home()), str(Path.cwd()), str(user_module.ROOT)):
             assert secret not in told
     assert (tmp_path / "session" / "uploads" / "mine.nrrd").is_file()
+
+
+def test_a_typed_path_leads_nowhere_else_once_the_page_is_served_to_others(places, tmp_path):
+    elsewhere = str(tmp_path / "elsewhere" / "secret.nrrd")
+    assert places.typed(elsewhere) == elsewhere
+    confined = Places(SimpleNamespace(folder=tmp_path / "session"), tmp_path / "data", confined=True)
+    assert confined.typed("data/head.nrrd") == str(tmp_path / "data" / "head.nrrd")
+    for text in (
+        elsewhere,
+        "../elsewhere/secret.nrrd",
+        "data/../elsewhere/secret.nrrd",
+        "~/secret.nrrd",
+        "c:\\\\secret.nrrd",
+        "..",
+    ):
+        assert Path(confined.typed(text)).parent in (tmp_path / "session", Path("data")), text
+    assert confined.typed("") == ""

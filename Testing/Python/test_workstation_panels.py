@@ -144,3 +144,24 @@ def test_a_button_with_a_shortcut_names_its_key_in_the_browser(an_empty_scene):
     assert 'data-shortcut="Space"' in page
     assert 'data-shortcut="Ctrl+Z"' in page
     assert "(Space)" in page
+
+
+def test_a_button_that_waits_for_a_typed_path_can_be_pressed_while_it_is_typed(an_empty_scene):
+    _, page = drawn_in_the_web("ModuleRegistration")
+    assert """!!panel.blocked['loadCt'] && typed !== 'panel.ct'""" in page
+    assert """typed = 'panel.ct'""" in page
+
+
+def test_good_news_of_what_is_to_be_done_goes_once_it_is_done(an_empty_scene):
+    from CranioNavLib.panel import StepState, StepStatus
+
+    view, _ = drawn_in_the_web("ModuleRegistration")
+    state, logic = view.server.state, view.model.logic
+    logic.addLandmark, logic.addLandmarkBlocked = lambda: "click on it", lambda: ""
+    click(view, "addLandmark")
+    assert state.panel["message"]["text"] == "click on it"
+    logic.planStatus = lambda: StepStatus(StepState.DONE)
+    view.refresh()
+    assert state.panel["message"]["text"] == ""
+    click(view, "addLandmark")
+    assert state.panel["message"]["text"] == "click on it", "said when it was done already"

@@ -39,7 +39,7 @@ PANEL = Panel(
                 ReadOut("boneDistance", "To the bone", "mm", large=True),
                 ReadOut("nearestTarget", "To the nearest target", large=True),
                 ReadOut("expectedError", "Error here, 95%", "mm", large=True),
-                ReadOut("position", "Tip, RAS", "mm"),
+                ReadOut("position", "Tip in the CT (right, front, up)", "mm"),
                 ParameterField("follow", "Slices follow the tip"),
                 ParameterField("zoom", "Zoom on the tip"),
                 ParameterField("ring", "Ring of the 95% error"),
@@ -120,11 +120,11 @@ class NavigationLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         node = scene.find("ReferenceToRas")
         status = (node.GetAttribute(scene.STATUS_ATTRIBUTE) or "") if node is not None else ""
         if not status:
-            return StepStatus(StepState.TODO, "register first")
+            return StepStatus(StepState.TODO, "register first (steps 5 and 6)")
         if status != "accepted":
             words = "by landmarks alone" if status == "landmarks" else "with a warning"
             return StepStatus(StepState.ATTENTION, f"registered {words}; see the verdict before trusting the tip")
-        return StepStatus(StepState.DONE, "" if self.tip() else "show a tool to the camera")
+        return StepStatus(StepState.DONE, "" if self.tip() else "Show a tool to the camera")
 
     def _surface(self) -> Any:
         node = scene.find("Bone")

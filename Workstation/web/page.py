@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from CranioNavLib.panel import Step
 from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import client, html
 from trame.widgets import vuetify3 as v3
@@ -38,6 +39,8 @@ html { overflow: hidden; }
 .buttons > .wide { flex-basis: 100%; }
 .buttons .v-btn { height: auto; min-height: 38px; padding: 6px 8px; }
 .buttons .v-btn__content { white-space: normal; line-height: 1.15; }
+.headline .v-alert { border-radius: 4px; }
+.said { overflow-wrap: anywhere; max-height: 7.5em; overflow-y: auto; }
 .part { border-top: 1px solid rgba(255, 255, 255, 0.12); padding-top: 12px; margin-top: 12px; }
 """
 
@@ -48,6 +51,8 @@ class Page:
     def __init__(self, server: Any, panels: dict[str, PanelView], layouts: Any, procedure: tuple[ProcedureStep, ...]) -> None:
         self.server, self.panels = server, panels
         server.state.step = procedure[0].name
+        server.state.speaks = ""  # the panel whose message is shown
+        server.state.typed = ""  # the part in whose field something is being typed that has not been sent yet
         server.state.trame__title = words.TITLE
         with VAppLayout(server) as self.layout:
             self.layout.root.theme = "dark"
@@ -60,7 +65,9 @@ class Page:
 
     def _draw_title(self, procedure: tuple[ProcedureStep, ...]) -> None:
         with v3.VAppBar(density="compact", flat=True, border=True):
-            v3.VAppBarTitle(words.TITLE)
+            v3.VAppBarTitle(words.TITLE, style="flex: none")
+            v3.VChip(words.SIMULATED, v_if="simulated", color="warning", variant="flat", size="small", classes="ml-3")
+            v3.VSpacer()
             draw_link()
             html.Div(words.DISCLAIMER, classes="text-body-2 text-medium-emphasis mr-4")
             draw_toolbar()
@@ -93,41 +100,83 @@ class Page:
             for number, step in enumerate(procedure, start=1):
                 after = procedure[number] if number < len(procedure) else None
                 with html.Div(v_show=f"step === '{step.name}'", classes="pa-4", raw_attrs=[f'data-panel="{step.name}"']):
-                    html.Div(f"{number}  {step.title}", classes="text-h6 mb-2")
-                    self._draw_what_next(step, after)
-                    if step.name == "ct":
-                        draw_files()
-                    draw_live(step.name)
+                    html.Div(f"{number}  {step.title}", classes="text-h6")
+                    with html.Div(classes="in-sight headline"):
+                        self._draw_what_next(step, procedure[: number - 1], after)
+                        draw_live(step.name)
                     for module, name in step.parts:
                         view = self.panels[module]
+                        shown = f"{view.key}.status['{name}'].state !== 'done'" if name == "resume" else "true"
                         only_simulated = module == HAND and name != "patient"
-                        with html.Div(classes="part", v_show="simulated" if only_simulated else "true"):
-                            view.draw(next(part for part in view.model.panel.steps if part.name == name))
+                        with html.Div(classes="part", v_show="simulated" if only_simulated else shown):
+                            view.draw(self._part(module, name))
                     if step.name == "report":
                         self._draw_files()
 
-    def _draw_what_next(self, step: ProcedureStep, after: ProcedureStep | None) -> None:
-        """One line of what to do now, and the way on, which is never locked."""
-        waiting = f"([{', '.join(self._statuses(step))}].find(one => one.state !== 'done') || {{ text: '' }}).text"
-        done = f"{self._state_of(step)} === 'done'"
+    def _draw_what_next(self, step: ProcedureStep, before: tuple[ProcedureStep, ...], after: ProcedureStep | None) -> None:
+        """What to do now with the one button for it, what was said of it, and the way on, which is never locked."""
+        done, busy = f"{self._state_of(step)} === 'done'", " || ".join(f"{key}.busy" for key in self._keys(step))
         with v3.VAlert(
             variant="tonal",
             density="compact",
             classes="mb-3",
-            color=(f"{done} ? 'success' : 'info'",),
+            color=(f"{{ done: 'success', 'needs attention': 'warning' }}[{self._state_of(step)}] || 'info'",),
             raw_attrs=[f'data-next="{step.name}"'],
         ):
-            now = f"'{words.NOW}' + ({waiting} || '{words.SEE_BELOW}')"
-            html.Div(f"{{{{ {done} ? '{words.DONE}' : {now} }}}}", classes="text-body-1")
-            if after is not None:
-                v3.VBtn(
-                    words.NEXT_STEP.format(title=after.title),
-                    classes="mt-2",
-                    size="small",
-                    variant=(f"{done} ? 'flat' : 'outlined'",),
-                    click=f"step = '{after.name}'",
-                    raw_attrs=['data-go="next"'],
-                )
+            texts = f"[{', '.join(self._statuses(step))}].map(one => one.text).filter(Boolean)[0]"
+            now = f"'{words.NOW}' + ({self._waiting(step)}.text || '{words.SEE_BELOW}')"
+            html.Div(f"{{{{ {done} ? '{words.DONE} ' + ({texts} || '') : {now} }}}}", v_if=f"!({busy})", classes="text-body-1")
+            self._draw_offer(step, done)
+            if step.name == "ct":
+                draw_files(f"!({done} || {busy})", f"!{self._offer(step)}")
+            for module in dict.fromkeys(module for module, _ in step.parts):
+                parts = [self._part(module, name) for one, name in step.parts if one == module]
+                self.panels[module].draw_said(parts)
+            self._draw_ways(step, before, after, done)
+
+    def _draw_offer(self, step: ProcedureStep, done: str) -> None:
+        """The button to press now; where all is done what the simulated hand may still show."""
+        v3.VBtn(
+            "{{ one.label }}",
+            v_for=f"one in {self._offer(step)} ? [{self._offer(step)}] : []",
+            key="one.name",
+            block=True,
+            classes="my-2",
+            color="primary",
+            variant=(f"{done} ? 'tonal' : 'flat'",),
+            click="typed = ''; trigger(one.panel + '_run', [one.name])",
+            raw_attrs=[':data-offer="one.name"'],
+        )
+
+    def _draw_ways(self, step: ProcedureStep, before: tuple[ProcedureStep, ...], after: ProcedureStep | None, done: str) -> None:
+        """Back to the first step that is not done where this one waits for it; and on."""
+        earlier = ", ".join(
+            f"{{ name: '{one.name}', title: '{number} {one.title}', state: {self._state_of(one)} }}"
+            for number, one in enumerate(before, start=1)
+        )
+        waits = f"(({done}) || {self._offer(step)} ? [] : [{earlier}].filter(one => one.state !== 'done').slice(0, 1))"
+        v3.VBtn(
+            f"{words.FIRST} {{{{ one.title }}}}",
+            v_for=f"one in {waits}",
+            key="one.name",
+            classes="mt-2 mr-2",
+            size="small",
+            color="primary",
+            variant="flat",
+            click="step = one.name",
+            raw_attrs=['data-go="first"'],
+        )
+        if after is not None:
+            v3.VBtn(
+                words.NEXT_STEP.format(title=after.title),
+                classes="mt-2",
+                size=(f"{done} ? 'default' : 'small'",),
+                block=(done,),
+                color=(f"{done} ? 'primary' : undefined",),
+                variant=(f"{done} ? 'flat' : 'text'",),
+                click=f"step = '{after.name}'",
+                raw_attrs=['data-go="next"'],
+            )
 
     def _draw_files(self) -> None:
         v3.VBtn(
@@ -142,15 +191,41 @@ class Page:
             raw_attrs=[':data-file="one"'],
         )
 
-    def _statuses(self, step: ProcedureStep) -> list[str]:
-        """JavaScript of the status of each part that has one."""
-        found = []
-        for module, name in step.parts:
-            view = self.panels[module]
-            if next(part for part in view.model.panel.steps if part.name == name).status:
-                found.append(f"{view.key}.status['{name}']")
-        return found
+    def _part(self, module: str, name: str) -> Step:
+        return next(part for part in self.panels[module].model.panel.steps if part.name == name)
+
+    def _keys(self, step: ProcedureStep) -> list[str]:
+        return [self.panels[module].key for module in dict.fromkeys(module for module, _ in step.parts)]
+
+    def _statuses(self, step: ProcedureStep, hand: bool = False) -> list[str]:
+        """JavaScript of the status of each part that has one; the simulated hand's do not make a step done."""
+        return [
+            f"{self.panels[module].key}.status['{name}']"
+            for module, name in step.parts
+            if self._part(module, name).status and (hand or module != HAND)
+        ]
 
     def _state_of(self, step: ProcedureStep) -> str:
         """A JavaScript expression: the state of the step's first part that is not done, else done."""
         return f"([{', '.join(self._statuses(step))}].map(one => one.state).find(one => one !== 'done') || 'done')"
+
+    def _open(self, step: ProcedureStep) -> str:
+        """A JavaScript expression: the parts that offer a button. Nothing is asked for beyond one that needs attention, but
+        of the simulated hand."""
+        parts = ", ".join(
+            f"{{ panel: '{self.panels[module].key}', hand: {str(module == HAND).lower()}, "
+            f"...{self.panels[module].key}.status['{name}'] }}"
+            for module, name in step.parts
+            if self._part(module, name).status
+        )
+        calm = "!all.slice(0, at).some(two => two.state === 'needs attention')"
+        return f"[{parts}].filter((one, at, all) => one.state !== 'done' && one.offer && (one.hand || {calm}))"
+
+    def _waiting(self, step: ProcedureStep) -> str:
+        """A JavaScript expression: the status of the part that offers the button, else of the first that is not done."""
+        waiting = f"[{', '.join(self._statuses(step, hand=True))}].filter(one => one.state !== 'done')"
+        return f"({self._open(step)}[0] || {waiting}[0] || {{ text: '' }})"
+
+    def _offer(self, step: ProcedureStep) -> str:
+        """A JavaScript expression: panel, name and label of the button to press now; undefined if there is none."""
+        return f"{self._open(step)}.map(one => ({{ panel: one.panel, ...one.offer }}))[0]"

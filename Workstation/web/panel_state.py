@@ -85,9 +85,10 @@ def _plain(value: Any) -> Any:
     return value.value if isinstance(value, Enum) else value
 
 
-def _status(model: PanelModel, step: Any) -> dict[str, str]:
-    status = model.status(step)
-    return {"state": status.state.value, "text": status.text}
+def _status(model: PanelModel, step: Any) -> dict[str, Any]:
+    status, offered = model.status(step), model.offered(step)
+    offer = {"name": offered.name, "label": offered.label} if offered is not None else None
+    return {"state": status.state.value, "text": status.text, "offer": offer}
 
 
 def _settings(model: PanelModel, field: PluginField) -> list[dict[str, Any]]:

@@ -10,6 +10,7 @@ from CranioNavLib.panel import (
     Action,
     FileField,
     Item,
+    Level,
     ListField,
     NodeField,
     ParameterField,
@@ -17,6 +18,7 @@ from CranioNavLib.panel import (
     PluginField,
     ReadOut,
     Step,
+    StepState,
     label_of,
 )
 from CranioNavLib.panel_model import PanelModel
@@ -28,6 +30,8 @@ from Workstation.web.panel_state import choices_of, panel_state, parse, translat
 
 Translation = Callable[[str], str]
 OF_THE_SESSION = ("recording_path", "output_folder", "calibration_folder")  # the session fills these in
+
+OF_PATHS = ("path", "file", "folder")  # how a plugin's setting that holds one is called
 
 # Okabe and Ito's colours, which the colour-blind tell apart; a sign stands beside each.
 COLORS = "({ good: '#2fbf8f', warning: '#f0b429', bad: '#ff7b5c', plain: undefined })"
@@ -44,12 +48,16 @@ class PanelView:
         key: str,
         shown: Translation = str,
         meant: Translation = str,
+        typed: Translation = str,
         before: Callable[[], object] = bool,
     ) -> None:
         self.server, self.model, self.key = server, model, key
         self._shown, self._meant = shown, meant  # texts on their way to the page and back
+        self._typed = typed  # and those of fields that hold a path
         self._before = before  # called before an action: what the devices have to say by now
         self._last = ""  # action whose message stands
+        self._said = ("", "")  # the message that stands, and the state of its step when it was said
+        self._part = ""  # the step that is being drawn
         self.refresh()
         model.listen(self.refresh)
         server.controller.trigger(f"{key}_change")(self._change)
@@ -62,12 +70,24 @@ class PanelView:
         """Put the panel's present state into the page's."""
         state = translated(panel_state(self.model), self._shown)
         state["last"] = self._last
+        if self._is_over(state):
+            state["message"] = {"text": "", "level": Level.PLAIN.value}
         if self.server.state[self.key] != state:
             with self.server.state as shared:
                 shared[self.key] = state
 
+    def _is_over(self, state: dict[str, Any]) -> bool:
+        """Whether the message tells of what was to be done ("pivot for 10 s") and it has been done since."""
+        owner = next((step for step in self.model.panel.steps if self._last in _pressed(step)), None)
+        now = state["status"][owner.name]["state"] if owner is not None else ""
+        if self._said[0] != state["message"]["text"]:
+            self._said = (state["message"]["text"], now)
+        good = state["message"]["level"] == Level.GOOD.value
+        return good and now == StepState.DONE.value and self._said[1] not in ("", now)
+
     def draw(self, step: Step) -> None:
-        """The widgets of one step, in the current trame context."""
+        """The widgets of one step, in the current trame context. `draw_said` shows what is running and was said."""
+        self._part = step.name
         if step.help:
             html.Div(step.help, classes="text-body-2 text-medium-emphasis mb-3")
         shown = [item for item in step.items if not _is_setting(item)]
@@ -84,7 +104,6 @@ class PanelView:
             ):
                 for item in settings:
                     self._draw_item(item)
-        self._draw_footer(step)
 
     def _draw_item(self, item: Item) -> None:
         if isinstance(item, Action):
@@ -119,16 +138,17 @@ class PanelView:
                 item.label,
                 block=True,
                 color="primary" if item.primary else None,
-                variant="flat" if item.primary else "tonal",
-                disabled=(f"!!{self.key}.blocked['{item.name}']",),
-                click=f"trigger('{self.key}_run', ['{item.name}'])",
+                variant="tonal",  # the one bright button is the one to press now, which the page draws
+                disabled=(f"!!{self.key}.blocked['{item.name}'] && typed !== '{self.key}.{self._part}'",),
+                click=f"typed = ''; trigger('{self.key}_run', ['{item.name}'])",
                 raw_attrs=[f'data-action="{item.name}"', *filter(None, [key])],
             )
-            html.Div(
-                f"{{{{ {self.key}.blocked['{item.name}'] }}}}",
-                v_if=f"{self.key}.blocked['{item.name}'] && !{self.key}.busy",
-                classes="text-caption text-medium-emphasis mt-1",
-            )
+            if item.primary:  # of the others the title says it: a screen full of reasons hides what matters
+                html.Div(
+                    f"{{{{ {self.key}.blocked['{item.name}'] }}}}",
+                    v_if=f"{self.key}.blocked['{item.name}'] && !{self.key}.busy && typed !== '{self.key}.{self._part}'",
+                    classes="text-caption text-medium-emphasis mt-1",
+                )
 
     def _draw_reading(self, item: ReadOut) -> None:
         reading = f"{self.key}.readings['{item.name}']"
@@ -163,7 +183,9 @@ class PanelView:
             v3.VSelect(items=(repr(choices_of(info)),), update_modelValue=changed, **common)
         else:
             entered = f"trigger('{self.key}_change', ['{item.name}', $event.target.value])"
-            v3.VTextField(suffix=info.unit, change=entered, type="number" if info.kind in (int, float) else "text", **common)
+            # a button that waits for what is being typed can be pressed at once: leaving the field sends it before the click
+            kind = "number" if info.kind in (int, float) else "text"
+            v3.VTextField(suffix=info.unit, change=entered, input=f"typed = '{self.key}.{self._part}'", type=kind, **common)
 
     def _draw_list(self, item: ListField) -> None:
         html.Div(item.label, classes="text-caption text-medium-emphasis", title=item.help)
@@ -218,11 +240,10 @@ class PanelView:
             v3.VSelect(v_else_if="one.choices", items=("one.choices",), update_modelValue=changed, **shared)
             v3.VTextField(v_else=True, change=entered, suffix=("one.unit",), **shared)
 
-    def _draw_footer(self, step: Step) -> None:
-        """What is running and what was last said; only at the step whose action it was."""
-        names = [item.name for item in step.items if isinstance(item, (Action, ListField))]
-        mine = f"{names!r}.includes({self.key}.last)"
-        with html.Div(v_if=f"{self.key}.busy && {mine}", classes="my-3"):
+    def draw_said(self, steps: list[Step]) -> None:
+        """What is running and what was last said, of an action of these steps."""
+        mine = f"{[name for step in steps for name in _pressed(step)]!r}.includes({self.key}.last)"
+        with html.Div(v_if=f"{self.key}.busy && {mine}", classes="mt-2"):
             html.Div(f"{{{{ {self.key}.busy.text || {self.key}.busy.label }}}} …", classes="text-body-2")
             v3.VProgressLinear(
                 model_value=(f"100 * {self.key}.busy.share",), indeterminate=(f"!{self.key}.busy.share",), height=6
@@ -230,15 +251,16 @@ class PanelView:
             v3.VBtn(words.CANCEL, size="small", variant="text", click=f"trigger('{self.key}_cancel')")
         html.Div(
             f"{{{{ {SIGNS}[{self.key}.message.level] + {self.key}.message.text }}}}",
-            v_if=f"{self.key}.message.text && {mine}",
+            v_if=f"{self.key}.message.text && speaks === '{self.key}' && {mine}",
             style=(f"{{ color: {COLORS}[{self.key}.message.level] }}",),
-            classes="text-body-1 my-3",
+            classes="text-body-2 mt-2 said",
             raw_attrs=[f'data-message="{self.key}"'],
         )
 
     def _change(self, name: str, value: Any) -> None:
         field = self._field(name)
-        value = self._meant(value) if isinstance(value, str) else value
+        if isinstance(value, str):
+            value = self._typed(value) if isinstance(field, FileField) else self._meant(value)
         self.model.change(field, parse(self.model.describe(field), value))
 
     def _change_setting(self, name: str, setting: str, value: Any) -> None:
@@ -246,22 +268,34 @@ class PanelView:
         door = self.model.settings(field)
         if door is not None:
             info = next(one for one in door.kind.describe() if one.name == setting)
+            value = self._typed(value) if isinstance(value, str) and setting.endswith(OF_PATHS) else value
             self.model.change_setting(field, setting, parse(info, value))
 
     def _pick(self, name: str, entry: str) -> None:
-        self._last = name
+        self._speaks(name)
         field = next(item for item in self.model.panel.items() if isinstance(item, ListField) and item.name == name)
         self.model.pick(field, entry)
 
     def run(self, name: str) -> None:
         """Do what a button says, as if it had been pressed."""
-        self._last = name
+        self._speaks(name)
         self._before()
         self.model.run(next(action for action in self.model.panel.actions() if action.name == name))
+
+    def _speaks(self, name: str) -> None:
+        """What this panel will say of it takes the place of what another has said."""
+        self._last, self._said = name, ("", "")
+        with self.server.state as shared:
+            shared.speaks = self.key
 
     def _field(self, name: str) -> Any:
         fields = (item for item in self.model.panel.items() if isinstance(item, (ParameterField, FileField, PluginField)))
         return next(item for item in fields if item.name == name)
+
+
+def _pressed(step: Step) -> list[str]:
+    """What can be pressed or picked in a step."""
+    return [item.name for item in step.items if isinstance(item, (Action, ListField))]
 
 
 def _is_setting(item: Item) -> bool:

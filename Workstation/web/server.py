@@ -35,7 +35,7 @@ def serve(
     from Workstation.web.pictures import PICTURES
     from Workstation.web.session_link import ALIVE
 
-    application = WorkstationApp(server, case, data)
+    application = WorkstationApp(server, case, data, confined=bool(token))
 
     def bound(web: Any) -> None:
         web.app.middlewares.append(_gate(token))

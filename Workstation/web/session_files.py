@@ -31,10 +31,14 @@ class Entry:
 
 
 class Places:
-    """Translates between the page's names and this computer's paths, and keeps the page within the two folders."""
+    """Translates between the page's names and this computer's paths, and keeps the page within the two folders.
 
-    def __init__(self, session: Any, data: Path | None = None) -> None:
+    Not `confined`, for a page on this computer alone, a path may also be typed in full.
+    """
+
+    def __init__(self, session: Any, data: Path | None = None, confined: bool = False) -> None:
         self._session, self._data = session, None if data is None else Path(data).resolve()
+        self._confined = confined
 
     def roots(self) -> dict[str, Path]:
         """The folders that the page may look into."""
@@ -57,6 +61,13 @@ class Places:
             return str(self.resolve(text))
         except InputError:
             return f"{name}/{Path(rest).name}"
+
+    def typed(self, text: str) -> str:
+        """The path that was typed into a field for one. Confined, any other than of the two folders is looked for in the
+        session's by its name alone."""
+        if not self._confined or not text.strip() or text.partition("/")[0] in self.roots():
+            return self.meant(text)
+        return str(Path(self._session.folder) / (re.split(r"[/\\]", text.strip())[-1].strip(".") or UPLOADS))
 
     def resolve(self, text: str) -> Path:
         """The path of a name that the page gave.

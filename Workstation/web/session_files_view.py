@@ -17,7 +17,10 @@ SCRIPT = """
   if (window.cranionavUpload) return;
   window.cranionavUpload = true;
   let request = null;
-  const say = (text) => document.querySelectorAll('[data-sending]').forEach((one) => { one.textContent = text; });
+  const say = (text) => {
+    document.querySelectorAll('[data-sending]').forEach((one) => { one.textContent = text; });
+    document.querySelectorAll('[data-cancel-upload]').forEach((one) => { one.style.display = request ? '' : 'none'; });
+  };
   const send = (file, folder) => new Promise((done, failed) => {
     const query = new URLSearchParams({ window: sessionStorage.getItem('cranionav-window') || '', folder, name: file.name });
     request = new XMLHttpRequest();
@@ -39,9 +42,10 @@ SCRIPT = """
         path = await send(file, folder);
         if (folder) path = path.slice(0, path.lastIndexOf('/'));
       }
+      request = null;
       say('');
       window.trame.trigger('files_pick', [path]);
-    } catch (error) { say('! ' + error.message); }
+    } catch (error) { request = null; say('! ' + error.message); }
     input.value = '';
     request = null;
   });
@@ -117,14 +121,16 @@ def _series_in(folder: Any) -> list[dict[str, str]]:
     return [{"uid": uid, "text": text} for uid, text in list_series(folder)]
 
 
-def draw_files() -> None:
-    """The button of the first step, and its dialog."""
+def draw_files(shown: str, first: str) -> None:
+    """The button of the first step, and its dialog; in JavaScript whether it is `shown`, and the `first` thing to press."""
     client.Script(SCRIPT)
     v3.VBtn(
         "Choose a CT …",
+        v_if=shown,
         block=True,
+        classes="my-2",
         color="primary",
-        variant="flat",
+        variant=(f"{first} ? 'flat' : 'tonal'",),
         click="trigger('files_open', [''])",
         raw_attrs=["data-files"],
     )
@@ -144,17 +150,27 @@ def draw_files() -> None:
                 click="trigger('files_open', [picker.up])",
                 classes="mb-2",
             )
-            html.Div("{{ picker.where || 'On the workstation' }}", classes="text-medium-emphasis")
+            html.Div(
+                "{{ picker.where || 'In the folders that the workstation offers' }}",
+                v_if="picker.entries.length",
+                classes="text-medium-emphasis",
+            )
             chosen = "trigger(one.kind === 'folder' ? 'files_open' : 'files_pick', [one.path])"
             _draw_lines(
                 "one in picker.entries", "one.path + one.kind", "one.kind === 'folder' ? one.name + ' …' : one.name", chosen
             )
-            html.Div("From this computer", classes="text-medium-emphasis mt-4")
+            html.Div("From the computer in front of you", classes="text-medium-emphasis mt-4")
             _draw_input("A file (NRRD, NIfTI, MetaImage)", "file", 'accept=".nrrd,.nii,.gz,.mha"')
             _draw_input("A folder of DICOM files", "folder", "webkitdirectory multiple")
             with html.Div(classes="d-flex align-center mt-2", style="gap: 12px"):
                 html.Div(raw_attrs=["data-sending"])
-                v3.VBtn("Cancel sending", size="small", variant="text", raw_attrs=["data-cancel-upload"])
+                v3.VBtn(
+                    "Cancel sending",
+                    size="small",
+                    variant="text",
+                    style="display: none",
+                    raw_attrs=["data-cancel-upload"],
+                )
         v3.VBtn("Close", variant="text", classes="mt-3", click="trigger('files_close')")
 
 

@@ -10,13 +10,19 @@ from Workstation.web.session_windows import OPEN, TAKE
 
 ALIVE = "alive"  # address that the page asks whether the server is there
 LOST_TITLE = "Connection lost"
-LOST_TEXT = "The session goes on in the workstation and nothing is lost. This window comes back by itself."
+LOST_TEXT = (
+    "What was measured is saved. This window comes back by itself. If it does not within a minute, "
+    "start the workstation again and choose: Go on with the last session."
+)
+# in the element itself: when the server is gone the page's own styles are gone, too
+LOST_STYLE = (
+    "position: fixed; inset: 0; z-index: 9999; display: flex; flex-direction: column; align-items: center; "
+    "justify-content: center; gap: 16px; background: rgba(10, 14, 18, 0.94); color: #fff; text-align: center; "
+    "padding: 32px; font: 22px/1.5 Roboto, sans-serif;"
+)
 SHUT_OUT = "The workstation was started anew. Open the address that it printed."
 WATCHING = "control.window !== my_window && my_window > 0"
 STYLE = """
-.link-lost { position: fixed; inset: 0; z-index: 9999; display: flex; flex-direction: column; align-items: center;
-  justify-content: center; gap: 16px; background: rgba(10, 14, 18, 0.9); color: #fff; text-align: center; padding: 32px; }
-.link-lost b { font-size: 40px; } .link-lost span { font-size: 22px; max-width: 30em; }
 .link-watching { position: fixed; bottom: 0; right: 0; left: 580px; z-index: 900; display: flex; align-items: center;
   justify-content: center; gap: 16px; padding: 8px; background: #3a2f12; color: #f0b429; border-top: 2px solid #f0b429; }
 [inert] .v-btn, [inert] .v-field, [inert] .v-list-item { opacity: 0.6; }
@@ -28,6 +34,7 @@ SCRIPT = f"""
   if (window.cranionavLink) return;
   window.cranionavLink = true;
   const store = window.sessionStorage, title = {LOST_TITLE!r}, lostText = {LOST_TEXT!r}, shutOut = {SHUT_OUT!r};
+  const lostStyle = {LOST_STYLE!r};
   if (store.getItem('cranionav-open') || !store.getItem('cranionav-window'))
     store.setItem('cranionav-window', String(Math.random()).slice(2) + Date.now());
   store.setItem('cranionav-open', '1');
@@ -40,8 +47,11 @@ SCRIPT = f"""
     if (!overlay) {{
       overlay = document.createElement('div');
       overlay.className = 'link-lost';
+      overlay.style.cssText = lostStyle;
       overlay.setAttribute('role', 'alert');
       overlay.append(document.createElement('b'), document.createElement('span'));
+      overlay.children[0].style.fontSize = '40px';
+      overlay.children[1].style.maxWidth = '30em';
       document.body.append(overlay);
     }}
     overlay.children[0].textContent = title;

@@ -39,12 +39,17 @@ PANEL = Panel(
             "resume",
             "Go on",
             "",
-            (Action("resumeSession", "Go on with the last session", "CT, points, settings and registration as they were left"),),
+            (
+                Action(
+                    "resumeSession", "Go on with the last session", "CT, points, settings and registration as left", primary=True
+                ),
+            ),
+            status="resumeStatus",
         ),
         Step(
             "report",
             "Report",
-            "The saved session is registered anew from its files, and what comes out is written as report, scene and transform.",
+            "The report is made from the saved files alone and compared with the registration on the screen.",
             (
                 Action("writeReport", "Write report and export", "Takes half a minute", primary=True),
                 ReadOut("reportFiles", "Written"),
@@ -105,6 +110,13 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
             return "a session is under way"
         return "" if self._resumable is not None else "no earlier session"
 
+    def resumeStatus(self) -> StepStatus:
+        """Whether there is a session to go on with, and of when it is."""
+        if self._resumable is None or self.resumeSessionBlocked():
+            return StepStatus(StepState.DONE)
+        saved = time.strftime("%d %b, %H:%M", time.localtime((self._resumable / "session.json").stat().st_mtime))
+        return StepStatus(StepState.TODO, f"go on with the session saved on {saved}, or begin anew")
+
     def _bring_back(
         self, folder: Path, state: dict[str, Any], lists: Any, volume: Any, bone: Any, patient: Any, take: Any
     ) -> str:
@@ -161,7 +173,7 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         """Why there is nothing to report."""
         node = scene.find("ReferenceToRas")
         if node is None or not node.GetAttribute(scene.STATUS_ATTRIBUTE):
-            return "register first"
+            return "register first (steps 5 and 6)"
         return "" if (self.session.folder / "ct.nrrd").is_file() else "the CT is still being saved"
 
     def _report_written(self, difference_mm: float) -> str:

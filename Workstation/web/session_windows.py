@@ -13,7 +13,7 @@ from wslink.websocket import LinkProtocol
 STATE_TOPIC = "trame.state.topic"
 OPEN, TAKE = "cranionav.window.open", "cranionav.window.take"
 WATCHER_MAY = frozenset({"wslink.hello", "trame.state.get", "trame.lifecycle.update", "trame.error.client", OPEN, TAKE})
-LOCAL_STATE = frozenset({"keys", "muted", "my_window", "trame__busy"})  # each window's own: not shared
+LOCAL_STATE = frozenset({"keys", "muted", "my_window", "trame__busy", "typed"})  # each window's own: not shared
 NOBODY = {"window": 0, "text": ""}
 LOST_BYTES = 16_000_000  # of one that takes nothing any more; it is closed, and comes back by itself
 

@@ -10,9 +10,10 @@ from typing import Annotated, Any
 import numpy as np
 from CranioNavLib import scene, scene_data
 from CranioNavLib.errors import InputError
-from CranioNavLib.module_logic import ParametersInScene
-from CranioNavLib.panel import Action, Panel, ParameterField, Progress, Step, Task
+from CranioNavLib.module_logic import ParametersInScene, done_or
+from CranioNavLib.panel import Action, Panel, ParameterField, Progress, Step, StepState, StepStatus, Task
 from CranioNavLib.parameters import Limits, Parameters
+from CranioNavLib.phantom.constants import MOVE_S
 from CranioNavLib.scripted_module import ScriptedLoadableModuleLogic
 from CranioNavLib.slicer_files import LabelledPoints
 
@@ -53,32 +54,40 @@ PANEL = Panel(
         Step(
             "pivot",
             "Simulated hand",
-            "Let the simulated hand pivot the stylus about a divot on the clamp, then press Pivot below.",
-            (Action("pivotStylus", "Hand: pivot the stylus"), Action("putAway", "Hand: put the tools away")),
+            "The simulated hand pivots the stylus about a small hollow (divot) on the head clamp.",
+            (
+                Action("pivotStylus", "Simulated hand: pivot the stylus", primary=True),
+                Action("putAway", "Simulated hand: put the tools away"),
+            ),
+            status="pivotHandStatus",
         ),
         Step(
             "landmarks",
             "Simulated hand",
-            "Let the simulated hand put the stylus on the landmark that is asked for, then read the point.",
-            (Action("touchNextLandmark", "Hand: touch the next landmark"),),
+            "The simulated hand puts the stylus on the landmark that is asked for. When it rests there, read the point.",
+            (Action("touchNextLandmark", "Simulated hand: touch the next landmark", primary=True),),
+            status="landmarkHandStatus",
         ),
         Step(
             "palpation",
             "Simulated hand",
-            "While the recording runs, let the simulated hand rest on each point that is asked for.",
-            (ParameterField("dwell_s"), Action("palpateAll", "Hand: palpate all points")),
+            "While the recording runs, the simulated hand rests on each point that is asked for. Those left out come again.",
+            (ParameterField("dwell_s"), Action("palpateAll", "Simulated hand: palpate all points", primary=True)),
+            status="palpationHandStatus",
         ),
         Step(
             "targets",
             "Simulated hand",
-            "Let the simulated hand seat the sphere tool on every target and read it: the ground truth.",
-            (Action("measureTargets", "Hand: measure the targets"),),
+            "The simulated hand reads every marker (target) with the sphere tool: where they truly are, to compare with.",
+            (Action("measureTargets", "Simulated hand: measure the targets", primary=True),),
+            status="targetHandStatus",
         ),
         Step(
             "tour",
             "Simulated hand",
-            "Let the simulated hand lead the stylus over the head.",
-            (Action("tourTargets", "Hand: visit the targets"),),
+            "The simulated hand leads the stylus from target to target.",
+            (Action("tourTargets", "Simulated hand: visit the targets", primary=True),),
+            status="tourHandStatus",
         ),
     ),
 )
@@ -94,6 +103,7 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         super().__init__()
         self.skip, self.taken = skip, taken  # go on to the next point; how many are taken; None: not recording
         self._visit: Visit | None = None
+        self._does = ("", "", 0.0)  # what was asked last, of what, and until when the hand is on its way
 
     def layPatient(self) -> Task:
         """Make the patient and put his planning CT and planned points into the scene."""
@@ -119,31 +129,30 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         scene_data.set_points("LandmarksCT", LabelledPoints(patient.landmark_labels, patient.landmarks_ras_mm))
         targets = tuple(f"Target {number + 1}" for number in range(len(patient.markers_ras_mm)))
         scene_data.set_points("TargetsCT", LabelledPoints(targets, patient.markers_ras_mm))
-        return f"simulated patient: {head}"
+        return f"simulated patient: {head}; his landmarks are planned already"
 
     def pivotStylus(self) -> str:
         """Pivot the stylus until told otherwise."""
         self._session().pivot()
+        self._does = ("pivot", "", 0.0)
         return "the hand pivots the stylus"
 
     def putAway(self) -> None:
         """Take the tools out of view."""
         for tool in ("Stylus", "Probe", "Sphere"):
             self._session().put_away(tool)
+        self._does = ("", "", 0.0)
 
     def touchNextLandmark(self) -> str:
         """Put the stylus on the first planned landmark that has not been digitised."""
-        session = self._session()
-        planned = scene_data.get_points("LandmarksCT").labels
-        node = scene.find("LandmarksPatient")
-        taken = {node.GetNthControlPointLabel(i) for i in range(node.GetNumberOfControlPoints())} if node is not None else set()
-        waiting = [label for label in planned if label not in taken]
+        session, waiting = self._session(), _waiting_landmarks()
         if not waiting:
             raise InputError("every landmark has been read; go on, or undo one")
         labels = list(session.patient.landmark_labels)
         if waiting[0] not in labels:
             raise InputError(f"the simulated patient has no landmark {waiting[0]!r}; he has {', '.join(labels)}")
         session.touch_landmark(labels.index(waiting[0]))
+        self._does = ("touch", waiting[0], time.monotonic() + MOVE_S)
         return f"the stylus goes to {waiting[0]}"
 
     def palpateAll(self) -> str:
@@ -191,14 +200,69 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         """Lead the stylus from target to target."""
         session = self._session()
         targets = session.patient.markers_ras_mm
+        self._does = ("tour", "", time.monotonic() + 4.0 * len(targets))
         session.play([(4.0 * number, lambda point=point: session.touch_point(point)) for number, point in enumerate(targets)])
         return f"the stylus goes to {len(targets)} targets, one after another"
+
+    # What is to be asked of the hand; without a simulation nothing is
+
+    def pivotHandStatus(self) -> StepStatus:
+        """Whether the stylus is being pivoted."""
+        return done_or(running_simulation() is None or self._does[0] == "pivot", "let the simulated hand pivot the stylus")
+
+    def landmarkHandStatus(self) -> StepStatus:
+        """Whether the stylus rests on the landmark that is asked for."""
+        waiting = _waiting_landmarks()
+        if running_simulation() is None or not waiting:
+            return StepStatus(StepState.DONE)
+        if self._does[:2] != ("touch", waiting[0]):
+            return StepStatus(StepState.TODO, f"let the simulated hand touch {waiting[0]}")
+        if self._is_on_its_way():
+            return StepStatus(StepState.ATTENTION, f"the stylus goes to {waiting[0]}")
+        return StepStatus(StepState.DONE)
+
+    def _is_on_its_way(self) -> bool:
+        return self._does[0] == "touch" and time.monotonic() < self._does[2]
+
+    def touchNextLandmarkBlocked(self) -> str:
+        """Why no landmark can be touched now."""
+        if self._is_on_its_way():
+            return "the hand is on its way"
+        return "" if _waiting_landmarks() else "every landmark has been read"
+
+    def palpationHandStatus(self) -> StepStatus:
+        """Whether the hand palpates while points are wanted."""
+        taken, node = self.taken(), scene.find("ProtocolPoints")
+        idle = taken is not None and node is not None and taken < node.GetNumberOfControlPoints() and self._visit is None
+        return done_or(running_simulation() is None or not idle, "let the simulated hand palpate the points")
+
+    def targetHandStatus(self) -> StepStatus:
+        """Whether the targets are measured."""
+        node = scene.find("TargetsPatient")
+        measured = node is not None and node.GetNumberOfControlPoints() > 0
+        return done_or(running_simulation() is None or measured, "let the simulated hand measure the targets")
+
+    def tourHandStatus(self) -> StepStatus:
+        """Whether the stylus is being led about."""
+        touring = self._does[0] == "tour" and time.monotonic() < self._does[2]
+        return done_or(running_simulation() is None or touring, "let the simulated hand visit the targets")
 
     def _session(self) -> Any:
         session = running_simulation()
         if session is None:
             raise InputError("no simulated patient lies on the table; use one in step 1")
         return session
+
+
+def _waiting_landmarks() -> list[str]:
+    """The planned landmarks that have not been read."""
+    labels = []
+    for role in ("LandmarksCT", "LandmarksPatient"):
+        node = scene.find(role)
+        labels.append(
+            [node.GetNthControlPointLabel(i) for i in range(node.GetNumberOfControlPoints())] if node is not None else []
+        )
+    return [label for label in labels[0] if label not in labels[1]]
 
 
 def running_simulation() -> Any:

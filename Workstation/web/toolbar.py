@@ -42,9 +42,8 @@ def draw_toolbar() -> None:
                 width=34,
                 raw_attrs=[f'data-key="{choice.key}"'],
             )
-    with v3.VBtnToggle(
+    with v3.VBtnToggle(  # a press on the lit one brings its window back after a drag
         model_value=("window",),
-        update_modelValue="$event && trigger('view_window', [$event])",
         density="compact",
         variant="text",
         classes="mr-1",
@@ -52,7 +51,13 @@ def draw_toolbar() -> None:
     ):
         for name in WINDOWS:
             title = words.WINDOWS[name]
-            v3.VBtn(title, value=name, title=words.WINDOW_HINT.format(title=title.lower()), size="small")
+            v3.VBtn(
+                title,
+                value=name,
+                title=words.WINDOW_HINT.format(title=title.lower()),
+                size="small",
+                click=f"trigger('view_window', ['{name}'])",
+            )
     html.Button(style="display: none", click="trigger('view_window', [''])", raw_attrs=['data-key="W"'])
     _switch("drag_window", "mdi-contrast-circle", f"{words.DRAG_WINDOW} (D)", "D", "view_drag")
     v3.VBtn(

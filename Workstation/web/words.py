@@ -4,9 +4,11 @@ from __future__ import annotations
 
 TITLE = "CranioNav"
 DISCLAIMER = "Research software, not a medical device"
+SIMULATED = "Simulated patient"
 
 # The open step
-NEXT_STEP = "Next: {title}"
+NEXT_STEP = "Next step: {title}"
+FIRST = "First:"
 DONE = "Done."
 NOW, SEE_BELOW = "Now: ", "see below"
 OPEN_FILE = "Open"

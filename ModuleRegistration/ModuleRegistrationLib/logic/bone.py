@@ -49,7 +49,7 @@ class BoneStep(RegistrationStep):
         promised = {POSITION_SD: bone.position_sd_mm, OFFSET_SD: bone.offset_sd_mm, THRESHOLD: bone.threshold_hu}
         for attribute, value in promised.items():
             table.SetAttribute(attribute, repr(float(value)))
-        return f"bone at {bone.threshold_hu:.0f} HU: {len(bone.outer_table.triangles)} triangles on the outer table"
+        return f"skull found above {bone.threshold_hu:.0f} HU; the points will be laid on the outer table"
 
     def findMarkers(self) -> Task:
         """Find titanium spheres in the CT; their centres become TargetsCT."""

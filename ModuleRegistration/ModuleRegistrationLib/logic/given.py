@@ -15,6 +15,18 @@ from ModuleRegistrationLib.panel_description import RegistrationParameters
 POSITION_SD, OFFSET_SD, THRESHOLD = "CranioNav.PositionSdMm", "CranioNav.OffsetSdMm", "CranioNav.ThresholdHu"
 
 
+WORDS = {  # for what is missing
+    "Bone": "bone",
+    "OuterTable": "bone",
+    "LandmarksCT": "landmarks in the CT",
+    "LandmarksPatient": "landmarks touched on the patient",
+    "SurfacePoints": "bone points",
+    "TargetsCT": "targets in the CT",
+    "TargetsPatient": "targets measured on the patient",
+    "PlausibilityPoints": "plausibility points",
+}
+
+
 class RegistrationStep(ParametersInScene[RegistrationParameters]):
     """What every step of the panel stands on."""
 
@@ -24,8 +36,8 @@ class RegistrationStep(ParametersInScene[RegistrationParameters]):
 
 def lacking(*roles: str) -> str:
     """Which of these nodes are missing or empty, in words; "" if none."""
-    empty = [role for role in roles if not _has_content(scene.find(role))]
-    return f"{', '.join(empty)} still missing" if empty else ""
+    empty = dict.fromkeys(WORDS[role] for role in roles if not _has_content(scene.find(role)))
+    return f"still missing: {', '.join(empty)}" if empty else ""
 
 
 def lacking_ct() -> str:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Optional
+from typing import TYPE_CHECKING, Any, Optional, Union
 
 from CranioNavLib import scene, scene_data
 from CranioNavLib.errors import InputError
-from CranioNavLib.module_logic import done_or, todo
+from CranioNavLib.module_logic import todo
 from CranioNavLib.panel import Level, Progress, Reading, StepState, StepStatus, Task
 from CranioNavLib.rigid import Array
 from CranioNavLib.slicer_files import LabelledPoints
@@ -35,6 +35,9 @@ class SurfaceRegistered:
     verdict: Verdict
 
 
+SAME_FRE_MM = 0.01  # of the same landmarks: the table's figures are rounded
+
+
 class RegisteringSteps(RegistrationStep):
     """Landmarks, surface, and what the panel says of them."""
 
@@ -44,14 +47,17 @@ class RegisteringSteps(RegistrationStep):
 
     # Landmarks
 
-    def registerLandmarks(self) -> str:
-        """Register the landmark pairs; writes ReferenceToRas and Results. Returns a message."""
+    def registerLandmarks(self) -> Union[str, Reading]:
+        """Register the landmark pairs; writes ReferenceToRas and Results. Returns a message, a warning if they do not fit."""
         from ModuleRegistrationLib.result_tables import landmark_rows
 
         found = self._landmarks()
         self.registered = None
         results.set_registration(found.reference_to_ras, "landmarks", landmark_rows(found), found)
-        return "; ".join([f"{len(found.labels)} landmark pairs, FRE {found.fre_mm:.2f} mm (RMS)", *found.warnings])
+        text, names = self._misfit()
+        doubts = [text] if names else list(found.warnings) or list(filter(None, [text]))  # one wrong point explains more
+        said = "; ".join([f"{len(found.labels)} landmark pairs, FRE {found.fre_mm:.2f} mm (RMS)", *doubts])
+        return Reading(said, Level.BAD) if doubts else said
 
     def registerLandmarksBlocked(self) -> str:
         """Why landmarks cannot be registered now."""
@@ -63,13 +69,53 @@ class RegisteringSteps(RegistrationStep):
         patient, planned, labels = pairs("LandmarksPatient", "LandmarksCT")
         return register_landmarks(patient, planned, labels, expected_fle_mm=self.parameters().read().landmark_fle_mm)
 
+    def _misfit(self) -> tuple[str, tuple[str, ...]]:
+        """Why the pairs in the scene are no good, in words, and the one that it is; "" if they fit."""
+        from ModuleRegistrationLib.registration.landmark_checks import misfit
+
+        if self.registerLandmarksBlocked():
+            return "", ()
+        try:
+            patient, planned, labels = pairs("LandmarksPatient", "LandmarksCT")
+        except InputError:  # to register says why
+            return "", ()
+        return misfit(patient, planned, labels, self.parameters().read().landmark_fle_mm) if len(labels) > 2 else ("", ())
+
+    def _isOfOthers(self) -> bool:
+        """Whether the landmarks' registration in force is not of the landmarks in the scene."""
+        from ModuleRegistrationLib.registration.landmark_checks import fit_rms_mm
+
+        try:
+            patient, planned, labels = pairs("LandmarksPatient", "LandmarksCT")
+        except InputError:
+            return True
+        rows = results.rows()
+        counted = names.FRE in rows and len(labels) > 2
+        return not counted or abs(float(rows[names.FRE]) - fit_rms_mm(patient, planned)) > SAME_FRE_MM
+
+    def dropMisfit(self) -> str:
+        """Take the landmark that does not fit off the patient's list, so that it is asked for again. Returns a message."""
+        name, node = self._misfit()[1][0], scene.find_or_create("LandmarksPatient")
+        node.RemoveNthControlPoint(node.GetControlPointIndexByLabel(name))
+        return f"{name} is taken out; touch it again"
+
+    def dropMisfitBlocked(self) -> str:
+        """Why there is no landmark to take out."""
+        return "" if self._misfit()[1] else "no single landmark stands out"
+
     def fre(self) -> Optional[Reading]:
         """FRE of the landmarks."""
-        return results.reading(names.FRE, level=Level.PLAIN)  # a low FRE is no sign of a low TRE
+        bad = results.status() == "landmarks" and self._misfit()[0]
+        return results.reading(names.FRE, level=Level.BAD if bad else Level.PLAIN)  # a low FRE is no sign of a low TRE
 
     def landmarkStatus(self) -> StepStatus:
-        """Whether landmarks are registered."""
-        return done_or(bool(results.status()), self.registerLandmarksBlocked() or "register the landmarks")
+        """Whether landmarks are registered, and fit."""
+        if not results.status():
+            return todo(self.registerLandmarksBlocked() or "register the landmarks")
+        if results.status() == "landmarks" and self._isOfOthers():
+            return todo("the landmarks have changed: register them again")
+        text, found = self._misfit() if results.status() == "landmarks" else ("", ())
+        return StepStatus(StepState.ATTENTION, text, "dropMisfit" if found else "") if text else StepStatus(StepState.DONE)
 
     # Surface
 
@@ -130,7 +176,7 @@ class RegisteringSteps(RegistrationStep):
         if refused:
             raise InputError("; ".join(verdict.messages) or "the registration is refused")
         scene_data.set_points("RegisteredPoints", LabelledPoints(points.labels, result.points_ras_mm))
-        return "; ".join([f"{verdict.status} after {result.iterations} iterations ({result.stop_reason})", *verdict.messages])
+        return "; ".join([f"{verdict.status}: {len(points)} bone points laid on the skull", *verdict.messages])
 
     def surfaceResidual(self) -> Optional[Reading]:
         """RMS distance of the bone points to the surface."""

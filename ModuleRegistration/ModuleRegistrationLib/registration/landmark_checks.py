@@ -8,7 +8,7 @@ from itertools import combinations, permutations
 import numpy as np
 import numpy.typing as npt
 from CranioNavLib.errors import InputError
-from CranioNavLib.rigid import Array, check_points
+from CranioNavLib.rigid import Array, check_points, transform_points
 
 DUPLICATE_MM = 1.0  # two landmarks closer than this are one landmark measured twice
 COLLINEAR_MM = 3.0  # RMS distance from the best line; below it the turn about that line is lost in the landmarks' own error
@@ -20,6 +20,7 @@ SMALLEST_SIZE_MM, LARGEST_SIZE_MM = 5.0, 500.0  # RMS distance from the centroid
 MOST_PERMUTED = 6  # all permutations up to this number of landmarks, exchanges of two beyond
 REFUSED_FRE_RATIO, WARNED_FRE_RATIO = 3.0, 2.0  # how much better another pairing must fit
 LEAST_FRE_MM = 4.0  # a fit this good needs no other pairing
+MISFIT_RATIO = 2.5  # of the usual error of a pair: an FRE above it has less than one chance in a thousand with four pairs
 
 
 def check_landmarks(
@@ -43,6 +44,45 @@ def check_landmarks(
         _check_distinct(points, where, names)
         _check_spread(points, where)
     return patient, ct, _check_pairing(patient, ct, names)
+
+
+def misfit(
+    patient_mm: npt.ArrayLike, ct_mm: npt.ArrayLike, labels: Sequence[str], usual_fle_mm: float
+) -> tuple[str, tuple[str, ...]]:
+    """What a fit leaves that is too far off to be the usual error of landmarks, in words; and which landmark alone it is.
+
+    Parameters
+    ----------
+    patient_mm, ct_mm : array-like, shape (N >= 3, 3), paired
+    labels : sequence of str, N names
+    usual_fle_mm : float
+        Root mean square 3D localisation error of one pair.
+
+    Returns
+    -------
+    text : str
+        "" if the fit is as good as such landmarks usually are, which says little of the error at a target.
+    names : tuple of str
+        The one landmark without which all others fit, if there is one.
+    """
+    patient, ct = np.asarray(patient_mm, dtype=float), np.asarray(ct_mm, dtype=float)
+    limit, given = MISFIT_RATIO * usual_fle_mm, fit_rms_mm(patient, ct)
+    if given <= limit:
+        return "", ()
+    left = [fit_rms_mm(np.delete(patient, i, axis=0), np.delete(ct, i, axis=0)) for i in range(len(ct))] if len(ct) > 3 else []
+    if left and min(left) * REFUSED_FRE_RATIO <= given and min(left) <= limit:
+        name = labels[int(np.argmin(left))]
+        said = f"{name} does not fit the other landmarks ({given:.1f} mm RMS with it, {min(left):.1f} mm without)"
+        return f"{said}; touch it again", (name,)
+    return f"the landmarks do not fit those of the CT ({given:.1f} mm RMS, usual are {usual_fle_mm:g} mm); touch them again", ()
+
+
+def fit_rms_mm(patient: Array, ct: Array) -> float:
+    """What the best rigid fit of paired points (N, 3) leaves, root mean square."""
+    from ModuleRegistrationLib.registration.landmarks import fit_rigid
+
+    misses = transform_points(fit_rigid(patient, ct), patient) - ct
+    return float(np.sqrt(np.mean(np.sum(misses**2, axis=1))))
 
 
 def _size(points: Array) -> float:

@@ -78,6 +78,22 @@ def worst_target_error():
     return np.linalg.norm(moved - targets, axis=1).max()
 
 
+def test_a_landmark_read_somewhere_else_needs_attention_and_is_asked_for_again(a_patient):
+    points = scene_data.get_points("LandmarksPatient")
+    good, moved = points.positions_mm.copy(), points.positions_mm + np.eye(len(points))[:, :1] * (60.0, 20.0, -30.0)
+    scene_data.set_points("LandmarksPatient", LabelledPoints(points.labels, moved))
+    said = a_patient.registerLandmarks()
+    assert (said.level, points.labels[0] in said.text) == (Level.BAD, True)
+    assert a_patient.landmarkStatus().state is StepState.ATTENTION
+    assert a_patient.landmarkStatus().action == "dropMisfit"
+    a_patient.dropMisfit()
+    assert scene_data.get_points("LandmarksPatient").labels == points.labels[1:]
+    scene_data.set_points("LandmarksPatient", LabelledPoints(points.labels, good))
+    assert "register them again" in a_patient.landmarkStatus().text, "the registration in force is of the wrong ones"
+    a_patient.registerLandmarks()
+    assert a_patient.landmarkStatus().state is StepState.DONE
+
+
 def test_landmarks_then_surface_then_verification(a_patient):
     said = a_patient.registerLandmarks()
     assert "4 landmark pairs" in said
@@ -265,7 +281,9 @@ def test_unpaired_landmarks_are_refused_and_nothing_is_written(a_patient):
 
 
 def test_what_is_still_missing_is_named(a_logic):
-    assert a_logic.registerSurfaceBlocked() == "OuterTable, LandmarksCT, LandmarksPatient, SurfacePoints still missing"
+    assert a_logic.registerSurfaceBlocked() == (
+        "still missing: bone, landmarks in the CT, landmarks touched on the patient, bone points"
+    )
     assert a_logic.verifyBlocked() == "register first"
     assert a_logic.segmentBoneBlocked() == "load a CT first"
     assert a_logic.saveResultsBlocked() == "register first"
@@ -291,7 +309,7 @@ def test_an_unknown_method_is_refused_with_those_that_are_installed(a_patient):
 def test_a_real_head_is_segmented_and_its_landmarks_are_suggested(a_logic):
     from CranioNavLib.sample_head import load_sample_head
 
-    assert a_logic.suggestLandmarksBlocked() == "Bone, OuterTable still missing"
+    assert a_logic.suggestLandmarksBlocked() == "find the bone first"
     a_logic.takeCt(load_sample_head())
     a_logic.segmentBone().run()
     a_logic.findSkin().run()

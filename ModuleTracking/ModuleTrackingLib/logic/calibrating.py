@@ -7,7 +7,7 @@ from typing import Any, Optional
 
 import numpy as np
 from CranioNavLib import scene, scene_data
-from CranioNavLib.module_logic import done_or
+from CranioNavLib.module_logic import done_or, todo
 from CranioNavLib.panel import Level, Reading, StepState, StepStatus
 from CranioNavLib.rigid import Array, invert_rigid
 
@@ -135,4 +135,7 @@ class CalibrationStep(ToolsStep):
         """Whether the chosen tool is calibrated."""
         if self.calibrator.failure and self.stream is not None:
             return StepStatus(StepState.ATTENTION, self.calibrator.failure)
-        return done_or(self._tool() in self.calibrator.found, "pivot the tool, unless it is calibrated")
+        tool = self._tool().lower()
+        if self.calibrator.busy:
+            return todo(f"go on tilting the {tool} to all sides" if self.calibrator.poses else f"show the {tool} to the camera")
+        return done_or(self._tool() in self.calibrator.found, f"press Pivot, and pivot the {tool} while its poses are collected")

@@ -61,7 +61,9 @@ class PointsStep(CalibrationStep):
         """Whether every planned landmark is digitised."""
         touched = _labels("LandmarksPatient")
         missing = [label for label in _labels("LandmarksCT") if label not in touched]
-        return todo(f"still to touch: {', '.join(missing)}") if missing else done_or(bool(touched), "touch the landmarks")
+        left = f" ({len(missing) - 1} more to come)" if len(missing) > 1 else ""
+        waiting = f"rest the tip on {missing[0]} and read the point{left}" if missing else ""
+        return todo(waiting) if missing else done_or(bool(touched), "touch the landmarks")
 
 
 def next_label(points: PointList) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Optional
 
 from CranioNavLib import scene_data
@@ -38,7 +39,8 @@ class MeasureStep(ProtocolStep):
 
     def measureRecordingBlocked(self) -> str:
         """Why nothing can be measured now."""
-        return "" if self.parameters().read().recording_path else "choose a recording first"
+        path = self.parameters().read().recording_path
+        return ("" if Path(path).is_file() else "nothing is recorded yet") if path else "choose a recording first"
 
     def pointCount(self) -> Optional[Reading]:
         """How many bone points there are."""

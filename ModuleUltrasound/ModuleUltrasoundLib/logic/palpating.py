@@ -9,7 +9,7 @@ import numpy as np
 from CranioNavLib import scene, scene_data
 from CranioNavLib.files import set_aside
 from CranioNavLib.module_logic import done_or
-from CranioNavLib.panel import Reading, StepState, StepStatus, Task
+from CranioNavLib.panel import Level, Reading, StepState, StepStatus, Task
 from CranioNavLib.rigid import invert_rigid, transform_points
 
 from ModuleUltrasoundLib.line_stream import PosedLine
@@ -159,6 +159,13 @@ class PalpationStep(ProbeStep, MeasureStep):
         done = f"{self._palpated.taken} of {self._palpated.total} points; rested {self._palpated.dwell:.0%} of the time needed"
         return Reading("; ".join(filter(None, [done, self._palpated.reason])))
 
+    def currentPoint(self) -> Optional[Reading]:
+        """The point to palpate now; None once they are measured."""
+        if self.recorder is None and count_of("SurfacePoints"):
+            return None
+        done = self._palpation is not None and len(self.taken()) >= count_of("ProtocolPoints")
+        return Reading("all are taken", Level.GOOD) if done else super().currentPoint()
+
     def recorded(self) -> Optional[Reading]:
         """How much has been recorded."""
         if self.recorder is None:
@@ -168,6 +175,9 @@ class PalpationStep(ProbeStep, MeasureStep):
     def palpationStatus(self) -> StepStatus:
         """Whether something is being or has been recorded."""
         if self.recorder is not None:
-            return StepStatus(StepState.ATTENTION, "recording; stop when all points are palpated")
+            taken, planned = len(self.taken()), count_of("ProtocolPoints")
+            if taken < planned:
+                return StepStatus(StepState.ATTENTION, f"recording: {taken} of {planned} points are taken")
+            return StepStatus(StepState.ATTENTION, "all points are taken: stop the recording", "stopRecording")
         done = Path(self.parameters().read().recording_path).is_file()
         return done_or(done, self.startRecordingBlocked() or "record")

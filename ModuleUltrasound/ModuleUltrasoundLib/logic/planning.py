@@ -26,7 +26,7 @@ class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
     parameterClass = UltrasoundParameters
     sessionRole = "UltrasoundSession"
     refusals = (DeviceError,)
-    deviceWord = "device"
+    deviceWord = "probe"
 
     def planProtocol(self) -> str:
         """Place the palpation points on the outer table; writes ProtocolPoints and Protocol. Returns a message."""
@@ -47,7 +47,7 @@ class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
 
     def planProtocolBlocked(self) -> str:
         """Why no points can be placed now."""
-        return "" if scene.find("OuterTable") is not None else "find the bone in the registration module first"
+        return "" if scene.find("OuterTable") is not None else "find the bone first"
 
     def protocolPoints(self) -> tuple[Array, Array, tuple[str, ...]]:
         """Positions (N, 3) in RAS, outward normals (N, 3) and labels of the planned points.

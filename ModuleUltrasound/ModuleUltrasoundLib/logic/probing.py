@@ -44,7 +44,7 @@ class ProbeStep(ProtocolStep):
         self._observation = scene.observe("ProbeToReference", self._takePose)
         self.stream = LineStream(device)
         self.stream.start()
-        return f"connecting to {device.title}"
+        return str(device.title)
 
     def disconnect(self) -> None:
         """Let go of the device."""

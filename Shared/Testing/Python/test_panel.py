@@ -385,3 +385,20 @@ def test_a_list_without_its_method_is_refused():
 
 def test_a_degree_sign_stands_close_to_its_number():
     assert [ReadOut("tilt", "Tilt", unit).spaced_unit for unit in ("°", "mm", "")] == ["°", " mm", ""]
+
+
+def test_what_to_press_next_is_the_main_action_that_can_be_used(a_model):
+    assert a_model.offered(KITCHEN.steps[0]) is item("squeeze")
+    a_model.logic.parameters().change(count=0)
+    assert a_model.offered(KITCHEN.steps[0]) is None, "no fruit left"
+    a_model.logic.parameters().change(count=1)
+    a_model.logic.status = lambda: StepStatus(StepState.ATTENTION, "bitter", "explode")
+    assert a_model.offered(KITCHEN.steps[0]) is item("explode"), "the status names it"
+    a_model.logic.status = lambda: StepStatus(StepState.DONE)
+    assert a_model.offered(KITCHEN.steps[0]) is None
+
+
+def test_an_action_may_bring_bad_news(a_model):
+    a_model.logic.squeeze = lambda: Reading("half of it is on the floor", Level.BAD)
+    assert a_model.run(item("squeeze"))
+    assert (a_model.message.text, a_model.message.level) == ("half of it is on the floor", Level.BAD)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import rigid, transform_points
-from ModuleRegistrationLib.registration.landmark_checks import check_landmarks
+from ModuleRegistrationLib.registration.landmark_checks import check_landmarks, misfit
 from ModuleRegistrationLib.registration.landmarks import register_landmarks
 from scipy.spatial.transform import Rotation
 
@@ -53,3 +53,18 @@ def test_a_swap_is_found_in_spite_of_landmark_errors() -> None:
         except InputError:
             found += 1
     assert found >= 95
+
+
+@pytest.mark.parametrize("wrong", range(4))
+def test_a_landmark_read_somewhere_else_is_named(wrong: int) -> None:
+    patient = PATIENT + np.random.default_rng(wrong).normal(0, 1.0, PATIENT.shape)
+    patient[wrong] += (55.0, -20.0, 30.0)
+    text, names = misfit(patient, CT, LABELS, 3.5)
+    assert names == (LABELS[wrong],)
+    assert text.startswith(f"{LABELS[wrong]} does not fit the other landmarks")
+
+
+def test_landmarks_of_usual_error_are_no_misfits() -> None:
+    rng = np.random.default_rng(2)  # 3.5 mm in space is 3.5 / sqrt(3) an axis
+    found = [misfit(PATIENT + rng.normal(0, 3.5 / np.sqrt(3), PATIENT.shape), CT, LABELS, 3.5)[0] for _ in range(300)]
+    assert found.count("") == 300
