@@ -8,7 +8,6 @@ from typing import Annotated
 from CranioNavLib.parameters import Limits, Parameters
 
 from ModuleRegistrationLib.registration.closest_fit import check_problem
-from ModuleRegistrationLib.registration.global_search import stages
 from ModuleRegistrationLib.registration.maximum_likelihood import solve
 from ModuleRegistrationLib.registration.problem import RegistrationProblem, RegistrationResult, SurfaceRegistration
 
@@ -24,9 +23,9 @@ class MaximumLikelihood(SurfaceRegistration):
         """How thoroughly to search; accuracy hardly depends on it once the minimum is found."""
 
         starts: Annotated[int, Limits(1, 2000), "poses drawn from the landmarks' uncertainty"] = 200
-        samples: Annotated[int, Limits(50, 20000), "posterior samples that the pose and its error come from"] = 400
+        samples: Annotated[int, Limits(50, 20000), "posterior samples that the pose and its error come from"] = 800
 
     def register(self, problem: RegistrationProblem) -> RegistrationResult:
         """See the base class."""
         check_problem(problem)
-        return solve(problem, stages(self.settings.starts), self.settings.samples)
+        return solve(problem, self.settings.starts, self.settings.samples)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Optional
 
 import numpy as np
 import numpy.typing as npt
@@ -53,6 +54,7 @@ class Model:
     alternatives: Array  # (N, K) mm along the beam from the chosen echo; NaN pads
     alternative_log_odds: Array  # (N, K) against the chosen echo
     feet: Callable[[Surface, Array], Feet] = find_feet
+    shared: Optional[Array] = None  # (N,) mm, errors along the normal that points share, as far as they are known
 
     def subset(self, index: npt.NDArray[np.int64]) -> Model:
         """The same model with some of the points."""
@@ -74,6 +76,11 @@ class State:
         """Some of the poses."""
         return State(self.motion[index], self.offset[index], self.speed[index], self.scale[index], self.outliers[index])
 
+    def and_of(self, other: State) -> State:
+        """These poses and then those of `other`."""
+        names = ("motion", "offset", "speed", "scale", "outliers")
+        return State(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
+
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
@@ -81,6 +88,7 @@ class Evaluation:
 
     cost: Array  # (M,) negative log posterior
     residuals: Array  # (M, N) mm, of the echo that is believed
+    echoes: Array  # (M, N) mm along the beam from the chosen echo to the one that is believed
     weights: Array  # (M, N) 1/mm^2
     inlier: Array  # (M, N) probability
     variances: Array  # (M, N) mm^2, before the common factor
@@ -138,6 +146,8 @@ def evaluate(model: Model, state: State) -> Evaluation:
     feet = model.feet(model.surface, points.reshape(-1, 3))
     normals = feet.directions.reshape(count, number, 3)
     residuals = feet.distances_mm.reshape(count, number) - state.offset[:, None]
+    if model.shared is not None:
+        residuals = residuals - model.shared
     back = (normals[..., None, :] @ turn)[..., 0, :]  # the normal as the measurement sees it
     variances = (back * (model.covariances @ back[..., None])[..., 0]).sum(axis=-1) + model.surface_variance
     slope = (normals * beams).sum(axis=-1)
@@ -146,7 +156,7 @@ def evaluate(model: Model, state: State) -> Evaluation:
     design[..., 3:6] = normals
     design[..., 6] = -1.0
     design[..., 7] = slope * model.depths
-    inlier, residuals, density = _inliers(model, state, residuals, variances, slope)
+    inlier, residuals, echoes, density = _inliers(model, state, residuals, variances, slope)
     heavy = (OUTLIER_FREEDOM + 1) / (
         OUTLIER_FREEDOM * OUTLIER_WIDTH_MM**2 + residuals**2
     )  # an outlier still pulls a little: its law's own slope
@@ -160,6 +170,7 @@ def evaluate(model: Model, state: State) -> Evaluation:
     return Evaluation(
         cost=cost,
         residuals=residuals,
+        echoes=echoes,
         weights=weights,
         inlier=inlier,
         variances=variances,
@@ -185,8 +196,9 @@ def _prior_cost(model: Model, state: State) -> Array:
     return cost - bad * np.log(state.outliers) - (points - bad) * np.log1p(-state.outliers)
 
 
-def _inliers(model: Model, state: State, residuals: Array, variances: Array, slope: Array) -> tuple[Array, Array, Array]:
-    """Probability of being an inlier (M, N), residual of the believed echo (M, N) and density (M, N)."""
+def _inliers(model: Model, state: State, residuals: Array, variances: Array, slope: Array) -> tuple[Array, Array, Array, Array]:
+    """Probability of being an inlier, residual of the believed echo, its distance from the chosen one, density; (M, N) each."""
+    echoes = np.zeros_like(residuals)
     spread = state.scale[:, None] * variances
     prior = (1 - state.outliers[:, None]) * model.inlier_prior
     if model.alternatives.shape[1]:
@@ -200,13 +212,14 @@ def _inliers(model: Model, state: State, residuals: Array, variances: Array, slo
         share = np.exp(exponent - top)
         total = share.sum(axis=-1)
         residuals = (share * options).sum(axis=-1) / total
+        echoes = (share[..., 1:] * np.nan_to_num(model.alternatives)).sum(axis=-1) / total
         logarithm = top[..., 0] + np.log(total) - np.log(np.exp(log_odds).sum(axis=1))
     else:
         logarithm = -(residuals**2) / (2 * spread)
     good = prior * np.exp(np.maximum(logarithm, -600)) / np.sqrt(2 * np.pi * spread)
     bad = (1 - prior) * OUTLIER_PEAK / (1 + residuals**2 / (OUTLIER_FREEDOM * OUTLIER_WIDTH_MM**2)) ** 2
     density = good + bad
-    return good / density, residuals, density
+    return good / density, residuals, echoes, density
 
 
 def normal_equations(model: Model, state: State, found: Evaluation) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.rigid import Array
 
-from ModuleRegistrationLib.registration.global_search import Stage, distinct, search
+from ModuleRegistrationLib.registration.global_search import distinct, search, stages, starts_for
 from ModuleRegistrationLib.registration.likelihood import Model, State, advance, evaluate, normal_equations, prepare
 from ModuleRegistrationLib.registration.posterior import sample_posterior
 from ModuleRegistrationLib.registration.problem import Minimum, RegistrationProblem, RegistrationResult
@@ -21,6 +21,7 @@ PLAUSIBLE_SCORE = 6.0  # a minimum e^6 less likely than the best is not looked a
 MOST_MINIMA = 8
 POLISH_STEPS, POLISH_STEP_MM, POLISHED_MM = 12, 2.0, 1e-2
 INLIER = 0.5
+LEAST_EFFECTIVE, MOST_ROUNDS, MORE = 60, 2, 4  # posterior samples that have to count; else a search from them and more of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +42,12 @@ class Solution:
     degrees_of_freedom: Optional[float] = None
 
 
-def solve(problem: RegistrationProblem, stages: tuple[Stage, ...], samples: int) -> RegistrationResult:
+def solve(problem: RegistrationProblem, starts: int, samples: int) -> RegistrationResult:
     """Register by maximum likelihood; the random draws follow from the problem's seed."""
     model, rng = prepare(problem), np.random.default_rng(problem.seed)
     dense = len(model.points) > DENSE
     coarse = model.subset(spread_points(model.points, SEARCH_POINTS)) if dense else model
-    minima, scores, steps = search(coarse, rng, stages)
+    minima, scores, steps = search(coarse, rng, stages(starts_for(model, starts)))
     minima = minima.take(np.flatnonzero(scores - scores[0] < PLAUSIBLE_SCORE)[:MOST_MINIMA])
     minima, scores, covariances, more = polish(coarse, minima)
     if dense:
@@ -85,6 +86,14 @@ def _solve_sparse(
     model: Model, minima: State, scores: Array, covariances: Array, samples: int, rng: np.random.Generator, steps: int
 ) -> Solution:
     posterior = sample_posterior(model, minima, covariances, scores, samples, rng)
+    for _ in range(MOST_ROUNDS):
+        if posterior.effective_samples >= LEAST_EFFECTIVE:
+            break
+        # a few samples have all the weight: they lie where a minimum is that the search has missed, or beside a crooked one
+        minima, scores, covariances, more = polish(model, minima.and_of(posterior.likeliest))
+        kept = np.flatnonzero(scores - scores[0] < PLAUSIBLE_SCORE)[:MOST_MINIMA]
+        minima, scores, covariances, steps = minima.take(kept), scores[kept], covariances[kept], steps + more
+        posterior = sample_posterior(model, minima, covariances, scores, MORE * samples, rng)
     order = np.argsort(-posterior.probabilities)
     return Solution(
         motion=posterior.motion,
@@ -133,7 +142,8 @@ def _result(problem: RegistrationProblem, model: Model, solution: Solution) -> R
     used = found.inlier[0] > INLIER
     residuals = found.residuals[0]
     beams = model.beams @ solution.motion[:3, :3].T
-    moved = model.points @ solution.motion[:3, :3].T + solution.motion[:3, 3] + beams * (model.depths * solution.speed)[:, None]
+    moved = model.points @ solution.motion[:3, :3].T + solution.motion[:3, 3]
+    moved += beams * (model.depths * solution.speed + found.echoes[0])[:, None]
     normals = found.design[0, :, 3:6]
     speed = problem.points.speed_of_sound_m_s
     return RegistrationResult(

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from CranioNavLib.rigid import Array, invert_rigid, rigid_from_vector
 from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp
@@ -22,6 +23,7 @@ PROPOSAL_STRETCH = 1.3  # its width beside the curvature's
 LOG_SCALE_SD = 0.35  # of the proposal for the common factor on the variances
 WEISZFELD_STEPS, CORE_MM = 12, 0.3
 LEAST_SHARE = 0.08  # of the samples that each minimum gets
+FOLLOWED = 20  # of the likeliest samples, where they are to be followed to a minimum that the search has not found
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +37,7 @@ class Posterior:
     speed_sd: float
     probabilities: Array  # (K,) of the minima
     effective_samples: float
+    likeliest: State  # of the samples, the best first
 
 
 def motion_vector(motion: Array, pivot: Array) -> Array:
@@ -75,11 +78,12 @@ def sample_posterior(
         np.full(count, minima.outliers[0]),
     )
     proposal = np.stack([_log_density(model, minima, roots, k, state) + np.log(share[k]) for k in range(len(share))])
-    log_weight = -evaluate(model, state).cost - logsumexp(proposal, axis=0)
+    cost = evaluate(model, state).cost
+    log_weight = -cost - logsumexp(proposal, axis=0)
     weight = np.exp(log_weight - log_weight.max())
     weight = np.minimum(weight, weight.mean() * np.sqrt(count))  # truncated: one lucky sample decides nothing
     weight = weight / weight.sum()
-    return _moments(model, minima, state, weight, np.argmax(proposal, axis=0))
+    return _moments(model, minima, state, weight, np.argmax(proposal, axis=0), np.argsort(cost))
 
 
 def _log_density(model: Model, minima: State, roots: Array, k: int, state: State) -> Array:
@@ -94,7 +98,7 @@ def _log_density(model: Model, minima: State, roots: Array, k: int, state: State
     return density
 
 
-def _moments(model: Model, minima: State, state: State, weight: Array, nearest: Array) -> Posterior:
+def _moments(model: Model, minima: State, state: State, weight: Array, nearest: Array, likeliest: npt.NDArray[np.int64]) -> Posterior:
     probabilities = np.bincount(nearest, weight, len(minima.motion))
     origin = minima.motion[int(np.argmax(probabilities))]
     vectors = motion_vector(state.motion @ invert_rigid(origin), model.pivot)
@@ -110,6 +114,7 @@ def _moments(model: Model, minima: State, state: State, weight: Array, nearest: 
         speed_sd=float(np.sqrt(weight @ (state.speed - speed) ** 2)),
         probabilities=np.asarray(probabilities, dtype=np.float64),
         effective_samples=float(1 / np.sum(weight**2)),
+        likeliest=state.take(likeliest[:FOLLOWED]),
     )
 
 

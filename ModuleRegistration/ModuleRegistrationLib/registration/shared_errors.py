@@ -9,7 +9,7 @@ shared errors in it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -37,7 +37,7 @@ JUMP_MM, JUMP_RATIO, SMOOTHED = 12.0, 4.0, 5  # a step between the medians of so
 EFFECT_SD_MM, EFFECT_FREEDOM = 0.17, 3.0  # what a shared error usually is, and how many groups that belief is worth
 THINNED = 250  # points to converge with, before all of them
 MOST_STEPS, STEP_MM, ENOUGH_MM = 25, 2.0, 5e-3
-MIXED_STEPS, VARIANCE_STEPS = 8, 6
+MIXED_STEPS, PATCH_STEPS, VARIANCE_STEPS = 15, 3, 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +57,11 @@ class Mixed:
     """Pose and shared errors solved for together, at a fixed linearisation."""
 
     step: Array  # (8,)
-    covariance: Array  # (8, 8)
-    scale: float  # factor on the points' own variances
+    effects: Array  # (E,) mm, the shared errors, set after set
     shared: Array  # (S,) mm^2, variance of each set's errors
-    gain: Array  # (8, N) what a point's error does to the pose
+    scale: float = 1.0  # factor on the points' own variances
+    covariance: Array = field(default_factory=lambda: np.zeros((PARAMETERS, PARAMETERS)))
+    gain: Array = field(default_factory=lambda: np.empty((PARAMETERS, 0)))  # (8, N) what a point's error does to the pose
 
 
 def find_sweeps(positions_mm: Array, groups: Index) -> Index:
@@ -91,13 +92,12 @@ def refine(model: Model, state: State, groups: Index) -> Refined:
     while steps < MOST_STEPS and moved > ENOUGH_MM:
         state, lengths = advance(thin, state, evaluate(thin, state), STEP_MM)
         steps, moved = steps + 1, float(lengths[0])
-    sweeps = [find_sweeps(model.points, groups)]
-    shared: Array = np.full(1, EFFECT_SD_MM**2)
+    sets = [find_sweeps(model.points, groups)]
+    mixed = Mixed(np.zeros(PARAMETERS), np.zeros(int(sets[0].max()) + 1), np.full(1, EFFECT_SD_MM**2))
     for _ in range(MIXED_STEPS):
-        found = evaluate(model, state)
-        mixed = solve_mixed(model, state, found, sweeps, shared)
-        shared, step = mixed.shared, mixed.step
-        arm = model.points - model.pivot
+        found = evaluate(replace(model, shared=known_errors(sets, mixed)), state)
+        mixed = solve_mixed(model, state, found, sets, mixed)
+        step, arm = mixed.step, model.points - model.pivot
         moved = float(np.sqrt(((np.cross(step[:3], arm) + step[3:6]) ** 2).sum(axis=1).mean()))
         state = State(
             rigid_from_vector(step[:3], step[3:6], model.pivot)[None] @ state.motion,
@@ -109,8 +109,14 @@ def refine(model: Model, state: State, groups: Index) -> Refined:
         steps += 1
         if moved < ENOUGH_MM:
             break
-    covariance, sds = _with_patches(model, state, mixed, sweeps)
-    return Refined(state, covariance, sds, steps, moved < ENOUGH_MM, EFFECT_FREEDOM + int(sweeps[0].max()) + 1)
+    covariance, sds = _with_patches(model, state, mixed, sets)
+    return Refined(state, covariance, sds, steps, moved < ENOUGH_MM, EFFECT_FREEDOM + int(sets[0].max()) + 1)
+
+
+def known_errors(sets: list[Index], mixed: Mixed) -> Array:
+    """(N,) the shared errors of each point, as solved for."""
+    starts = np.cumsum([0, *(int(members.max()) + 1 for members in sets)])
+    return np.asarray(sum(mixed.effects[start + members] for start, members in zip(starts, sets)), dtype=np.float64)
 
 
 def _with_patches(model: Model, state: State, mixed: Mixed, sweeps: list[Index]) -> tuple[Array, tuple[float, ...]]:
@@ -119,48 +125,60 @@ def _with_patches(model: Model, state: State, mixed: Mixed, sweeps: list[Index])
     Weighing the points by these errors, too, would give up more than it wins: their scale and shape are only guessed.
     """
     patches = [find_patches(model.points, side) for side in PATCHES_MM]
-    shared = np.concatenate([mixed.shared, np.full(len(patches), EFFECT_SD_MM**2)])
-    for _ in range(2):
-        shared = solve_mixed(model, state, evaluate(model, state), sweeps + patches, shared).shared
+    sets = sweeps + patches
+    numbers = [int(members.max()) + 1 for members in patches]
+    every = Mixed(
+        np.zeros(PARAMETERS),
+        np.concatenate([mixed.effects, np.zeros(sum(numbers))]),
+        np.concatenate([mixed.shared, np.full(len(patches), EFFECT_SD_MM**2)]),
+    )
+    for _ in range(PATCH_STEPS):
+        every = solve_mixed(model, state, evaluate(replace(model, shared=known_errors(sets, every)), state), sets, every)
     covariance = mixed.covariance
-    for members, variance in zip(patches, shared[1:]):
+    for members, variance in zip(patches, every.shared[1:]):
         reach = np.stack([np.bincount(members, row) for row in mixed.gain])
         covariance = covariance + variance * reach @ reach.T
-    return covariance, tuple(float(sd) for sd in np.sqrt(shared))
+    return covariance, tuple(float(sd) for sd in np.sqrt(every.shared))
 
 
-def solve_mixed(model: Model, state: State, found: Evaluation, sets: list[Index], shared: Array) -> Mixed:
-    """One Gauss-Newton step of pose, offset and speed beside the shared errors, and the variances that the data ask for."""
+def solve_mixed(model: Model, state: State, found: Evaluation, sets: list[Index], before: Mixed) -> Mixed:
+    """One Gauss-Newton step of pose, offset and speed beside the shared errors, and the variances that the data ask for.
+
+    `found` is the evaluation with the shared errors of `before` taken out: an outlier is what stands out of its sweep.
+    """
     hessian, gradient = normal_equations(model, state, found)
     # an outlier law flattens the likelihood near its border: the curvature is less than the weights say
     weights, residuals, inlier = found.weights[0], found.residuals[0], found.inlier[0]
-    weights = weights * (1 - np.minimum((1 - inlier) * weights * residuals**2, MOST_FLAT))
+    curvature = weights * (1 - np.minimum((1 - inlier) * weights * residuals**2, MOST_FLAT))
     sizes = [int(members.max()) + 1 for members in sets]
     member = np.concatenate([[-1] * PARAMETERS, np.repeat(np.arange(len(sets)), sizes)])
     design = np.concatenate([found.design[0], *(-np.eye(size)[members] for size, members in zip(sizes, sets))], axis=1)
-    priors = hessian[0] - found.design[0].T @ (found.design[0] * found.weights[0][:, None])
-    pull = gradient[0] - found.design[0].T @ (found.weights[0] * residuals)
-    information = design.T @ (design * weights[:, None])
+    priors = hessian[0] - found.design[0].T @ (found.design[0] * weights[:, None])
+    pull = gradient[0] - found.design[0].T @ (weights * residuals)
+    information = design.T @ (design * curvature[:, None])
     slope = design.T @ (weights * residuals)
-    start = float(state.scale[0])
+    start, shared = float(state.scale[0]), before.shared
     scale = start
     for _ in range(VARIANCE_STEPS):
         full = information * (start / scale)
         full[:PARAMETERS, :PARAMETERS] += priors
-        full[range(PARAMETERS, len(full)), range(PARAMETERS, len(full))] += 1 / np.repeat(shared, sizes)
+        precision = 1 / np.repeat(shared, sizes)
+        full[range(PARAMETERS, len(full)), range(PARAMETERS, len(full))] += precision
         right = slope * (start / scale)
         right[:PARAMETERS] += pull
+        right[PARAMETERS:] += precision * before.effects
         covariance = np.asarray(np.linalg.inv(full), dtype=np.float64)
         solution = -covariance @ right
-        spread = np.diagonal(covariance)
+        effects = before.effects + solution[PARAMETERS:]
+        spread = np.diagonal(covariance)[PARAMETERS:]
         free = float(np.sum(covariance * information) * start / scale)  # parameters that the points have paid for
         left = residuals + design @ solution
         squares = float(np.sum(inlier * left**2 / found.variances[0]))
         scale = max((squares + SCALE_FREEDOM) / (max(float(inlier.sum()) - free, 0.0) + SCALE_FREEDOM), LEAST_SCALE)
+        shared = shared.copy()
         for k in range(len(sets)):
-            mine = member == k
+            mine = member[PARAMETERS:] == k
             known = sizes[k] - float(spread[mine].sum()) / shared[k]
-            shared = shared.copy()
-            shared[k] = (float(np.sum(solution[mine] ** 2)) + EFFECT_FREEDOM * EFFECT_SD_MM**2) / (known + EFFECT_FREEDOM)
-    gain = covariance[:PARAMETERS] @ (design * weights[:, None]).T * (start / scale)
-    return Mixed(solution[:PARAMETERS], covariance[:PARAMETERS, :PARAMETERS], scale, shared, gain)
+            shared[k] = (float(np.sum(effects[mine] ** 2)) + EFFECT_FREEDOM * EFFECT_SD_MM**2) / (known + EFFECT_FREEDOM)
+    gain = covariance[:PARAMETERS] @ (design * curvature[:, None]).T * (start / scale)
+    return Mixed(solution[:PARAMETERS], effects, shared, scale, covariance[:PARAMETERS, :PARAMETERS], gain)

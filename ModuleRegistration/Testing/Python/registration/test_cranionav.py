@@ -105,6 +105,8 @@ def test_a_wrong_echo_is_exchanged_for_the_one_that_fits(a_case) -> None:
     result = METHOD.register(replace(case.problem, points=moved))
     reference = METHOD.register(case.problem)
     assert result.used[wrong].all()
+    where_believed = case.problem.surface.closest(result.points_ras_mm[wrong]).distances_mm
+    assert np.allclose(where_believed, np.abs(result.residuals_mm[wrong]), atol=0.1)
     apart = case.tre(result.reference_to_ras).mean() - case.tre(reference.reference_to_ras).mean()
     assert abs(apart) < 0.4
 

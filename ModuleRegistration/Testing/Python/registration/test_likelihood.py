@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from CranioNavLib.rigid import invert_rigid, rigid_from_vector
-from ModuleRegistrationLib.registration.global_search import draw_starts, search, stages
+from ModuleRegistrationLib.registration.global_search import draw_starts, search, stages, starts_for
 from ModuleRegistrationLib.registration.likelihood import State, evaluate, prepare
 from ModuleRegistrationLib.registration.posterior import motion_vector
 
@@ -48,6 +48,11 @@ def test_the_search_finds_the_true_minimum_from_poor_landmarks(a_case) -> None:
         minima, _, _ = search(prepare(case.problem), np.random.default_rng(0), stages(200))
         found += case.tre(minima.motion[0] @ case.problem.initial_reference_to_ras).mean() < 3
     assert found >= 7
+
+
+def test_landmarks_that_leave_the_pose_open_ask_for_more_starts(a_case) -> None:
+    assert starts_for(prepare(a_case(1, landmark_sd=1.0).problem), 200) == 200
+    assert 300 < starts_for(prepare(a_case(1, landmark_sd=15.0).problem), 200) <= 800
 
 
 def test_a_motions_vector_is_the_inverse_of_the_motion() -> None:

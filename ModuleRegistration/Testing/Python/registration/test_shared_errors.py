@@ -31,13 +31,14 @@ def test_outliers_do_not_end_a_sweep() -> None:
 
 def test_the_spread_of_the_sweeps_biases_is_estimated(a_case) -> None:
     found = []
-    for bias_sd in (0.0, 0.5):
-        problem = a_case(1, repeats=20, group_bias_sd=bias_sd, landmark_sd=1.0).problem
+    for bias_sd, outlier_share in ((0.0, 0.0), (0.5, 0.0), (0.5, 0.25)):
+        problem = a_case(1, repeats=20, group_bias_sd=bias_sd, landmark_sd=1.0, outlier_share=outlier_share).problem
         model = prepare(problem)
         state = State(np.eye(4)[None], *(np.array([value]) for value in (0.0, 0.0, 1.0, 0.1)))
         found.append(refine(model, state, problem.points.groups).shared_sds_mm[0])
     assert found[0] < 0.15
     assert 0.2 < found[1] < 0.8
+    assert abs(found[2] - found[1]) < 0.2 * found[1]  # a sweep's samples are no outliers because its bias is large
 
 
 def test_the_bias_of_sweeps_hardly_moves_the_pose(a_case) -> None:
