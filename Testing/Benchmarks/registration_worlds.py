@@ -16,7 +16,7 @@ import csv
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +33,7 @@ from ModuleRegistrationLib.registration.landmarks import fit_rigid, motion_jacob
 from ModuleRegistrationLib.registration.problem import METHODS, RegistrationProblem
 from ModuleRegistrationLib.registration.verdict import judge
 from scipy.spatial.transform import Rotation
+from ultrasound_points import Echoes, draw_echoes
 
 TRUE_LEVELS_HU = (300.0, 360.0, 420.0)
 SHAPES = ((1.0, 1.0, 1.0), (0.95, 1.05, 0.98))  # the head, and another one stretched from it
@@ -55,6 +56,7 @@ class Condition:
     points: int = 18
     sweep: bool = False
     spread: str = "head"  # head, side, vault
+    ultrasound: bool = False
 
 
 CONDITIONS = {
@@ -65,6 +67,11 @@ CONDITIONS = {
     "sweep": Condition(points=2000, sweep=True),
     "sweep, poor landmarks": Condition(landmark_sd_mm=6.9, points=2000, sweep=True),
     "sweep, outliers": Condition(points=2000, sweep=True, outlier_share=0.2),
+    "ultrasound": Condition(ultrasound=True),
+    "ultrasound, outliers": Condition(ultrasound=True, outlier_share=0.2),
+    "ultrasound, poor landmarks": Condition(ultrasound=True, landmark_sd_mm=6.9),
+    "ultrasound sweep": Condition(ultrasound=True, points=1000, sweep=True),
+    "ultrasound sweep, outliers": Condition(ultrasound=True, points=1000, sweep=True, outlier_share=0.2),
     "one side": Condition(spread="side"),
     "vault": Condition(spread="vault"),
 }
@@ -92,7 +99,7 @@ class Head:
         return np.where(wrong[:, None], np.nan, points), hits.normals
 
 
-@lru_cache(maxsize=8)
+@cache
 def head(shape: int, level_hu: float, slice_mm: float) -> Head:
     """One of the heads."""
     import SimpleITK
@@ -219,33 +226,51 @@ def draw_world(seed: int, condition: Condition) -> World:
     points, normals = skull.touch(azimuth, elevation)
     kept = _even(np.isfinite(points[:, 0]), 1 if condition.sweep else len(PATCHES), condition.points)
     points, normals, sweeps = points[kept], normals[kept], sweeps[kept]
-    shared = draw_errors(rng, sweeps, sd_mm, condition.sweep)
-    measured = points + normals * shared[:, None] + rng.normal(0, sd_mm, points.shape)
-    outliers = bad.random(len(points)) < condition.outlier_share
-    side = np.where(bad.random(len(points)) < bad.choice([0.5, 0.8, 1.0]), 1.0, -1.0)  # mostly too shallow
-    measured = measured + (outliers * side * bad.uniform(2, 8, len(points)))[:, None] * normals
+    if condition.ultrasound:
+        shared = draw_errors(rng, sweeps, 0.0, condition.sweep) if condition.sweep else np.zeros(len(points))
+        place = points + normals * shared[:, None]  # what the depth's zero does not explain: coupling, the tracker's drift
+        found = draw_echoes(rng, bad, place, normals, azimuth[kept], elevation[kept], condition.outlier_share)
+    else:
+        found = draw_touched(rng, bad, points, normals, draw_errors(rng, sweeps, sd_mm, condition.sweep), sd_mm, condition)
     back = invert_rigid(truth)
     touched = transform_points(back, digitised)
     problem = RegistrationProblem(
         surface=skull.given.outer_table,
-        points=BonePoints.palpated(transform_points(back, measured), STYLUS_POINT_SD_MM),
+        points=found.points.transformed(back),
         initial_reference_to_ras=fit_rigid(touched, landmarks),
         landmarks_ct_mm=landmarks,
         landmarks_patient_mm=touched,
         surface_sd_mm=skull.given.position_sd_mm,
         surface_offset_sd_mm=skull.given.offset_sd_mm,
     )
-    return World(
-        problem, truth, targets, outliers, _bound(points[~outliers], normals[~outliers], sd_mm, landmarks, condition, targets)
-    )
+    return World(problem, truth, targets, found.outliers, _bound(points, normals, found, landmarks, condition, targets))
 
 
-def _bound(points: Array, normals: Array, sd_mm: float, landmarks: Array, condition: Condition, targets: Array) -> float:
-    """Mean TRE of the Cramer-Rao bound: independent noise, an unknown offset, and the landmarks."""
-    pivot = points.mean(axis=0)
-    rows = np.einsum("ni,nij->nj", normals, motion_jacobian(points, pivot))
-    design = np.column_stack([rows, np.ones(len(points))]) / sd_mm
+def draw_touched(
+    rng: np.random.Generator,
+    bad: np.random.Generator,
+    points: Array,
+    normals: Array,
+    shared: Array,
+    sd_mm: float,
+    condition: Condition,
+) -> Echoes:
+    """Points touched with a stylus, which has no beam and no speed of sound."""
+    measured = points + normals * shared[:, None] + rng.normal(0, sd_mm, points.shape)
+    outliers = bad.random(len(points)) < condition.outlier_share
+    side = np.where(bad.random(len(points)) < bad.choice([0.5, 0.8, 1.0]), 1.0, -1.0)  # mostly too shallow
+    measured = measured + (outliers * side * bad.uniform(2, 8, len(points)))[:, None] * normals
+    return Echoes(BonePoints.palpated(measured, STYLUS_POINT_SD_MM), outliers, sd_mm, np.zeros(len(points)), 1.0)
+
+
+def _bound(points: Array, normals: Array, found: Echoes, landmarks: Array, condition: Condition, targets: Array) -> float:
+    """Mean TRE of the Cramer-Rao bound: independent noise, an unknown offset and speed of sound, and the landmarks."""
+    good = ~found.outliers
+    pivot = points[good].mean(axis=0)
+    rows = np.einsum("ni,nij->nj", normals[good], motion_jacobian(points[good], pivot))
+    design = np.column_stack([rows, np.ones(len(rows)), found.reach_mm[good]]) / found.sd_mm
     information = design.T @ design
+    information[7, 7] += 1 / found.speed_sd**2
     pairs = motion_jacobian(landmarks, pivot).reshape(-1, 6) / condition.landmark_sd_mm
     information[:6, :6] += pairs.T @ pairs
     return float(predict_tre(np.linalg.inv(information)[:6, :6], pivot, targets).mean_mm.mean())
