@@ -77,13 +77,11 @@ class Surface:
     @cached_property
     def vertex_normals(self) -> Array:
         """(V, 3) unit outward normals, area-weighted over the triangles around each vertex."""
-        weighted = self._spanned(self.triangles)
-        summed = np.zeros_like(self.vertices_mm)
-        for axis in range(3):
-            weights = np.ascontiguousarray(weighted[:, axis])
-            for corner in range(3):
-                summed[:, axis] += np.bincount(self.triangles[:, corner], weights, len(summed))
-        return _unit(summed)
+        from scipy.sparse import csc_matrix
+
+        corners, starts = self.triangles.ravel(), np.arange(0, self.triangles.size + 1, 3)
+        around = csc_matrix((np.ones(len(corners)), corners, starts), shape=(len(self.vertices_mm), len(self.triangles)))
+        return _unit(np.asarray(around @ self._spanned(self.triangles)))
 
     @cached_property
     def center_mm(self) -> Array:
