@@ -98,7 +98,6 @@ class Palpation:
         self.settings = settings or PalpationSettings()
         self.refused: Counter[str] = Counter()  # lines that did not count, by reason
         self._taken: list[TakenPoint] = []
-        self._skipped: set[int] = set()
         self._dwell: deque[PalpationLine] = deque()
         self._target: Optional[int] = 0
         self._target_mm: Optional[Array] = None
@@ -112,13 +111,13 @@ class Palpation:
 
     @property
     def target(self) -> Optional[int]:
-        """The point that the user is on; None when all are taken or skipped."""
+        """The point that the user is on; None when all are taken."""
         return self._target
 
     @property
     def open_points(self) -> list[bool]:
         """For each point of the protocol whether it is still to be palpated."""
-        closed = {point.target for point in self._taken} | self._skipped
+        closed = {point.target for point in self._taken}
         return [index not in closed for index in range(len(self.labels))]
 
     def aim(self, target: int, position_mm: Optional[Array] = None) -> None:
@@ -135,12 +134,6 @@ class Palpation:
             self._dwell.clear()
         self._target, self._target_mm = target, None if position_mm is None else np.asarray(position_mm, dtype=float)
 
-    def skip(self) -> None:
-        """Leave the present point out and go on to the next open one."""
-        if self._target is not None:
-            self._skipped.add(self._target)
-            self._advance()
-
     def undo(self) -> Optional[TakenPoint]:
         """Take back the last point and return to it; None if there is none."""
         if not self._taken:
@@ -149,10 +142,6 @@ class Palpation:
         self._dwell.clear()
         self._target, self._target_mm = point.target, None
         return point
-
-    def why_not(self) -> str:
-        """The most frequent reason for which lines did not count; empty if all did."""
-        return self.refused.most_common(1)[0][0] if self.refused else ""
 
     # -- lines
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from enum import Enum
+from typing import Annotated, Optional
 
 from CranioNavLib.panel import Action, FileField, NodeField, Panel, ParameterField, PluginField, ReadOut, Step
 from CranioNavLib.parameters import Limits, Parameters
@@ -14,11 +15,31 @@ from ModuleUltrasoundLib.measure import EchoSettings
 RECORDINGS = ("Recording (*.igs.mha *.igs.mhd *.mha)",)
 
 
+class PatientLies(str, Enum):
+    """What of the head the table hides from the probe."""
+
+    FREE = "head is free all round"
+    BACK = "on the back"
+    LEFT = "on the left side"
+    RIGHT = "on the right side"
+    FACE = "face down"
+
+
+TOWARDS_TABLE: dict[PatientLies, Optional[tuple[float, float, float]]] = {  # RAS
+    PatientLies.FREE: None,
+    PatientLies.BACK: (0.0, -1.0, 0.0),
+    PatientLies.LEFT: (-1.0, 0.0, 0.0),
+    PatientLies.RIGHT: (1.0, 0.0, 0.0),
+    PatientLies.FACE: (0.0, 1.0, 0.0),
+}
+
+
 @dataclass(frozen=True)
 class UltrasoundParameters(Parameters):
     """What the ultrasound module keeps in the scene."""
 
     device: Annotated[str, "where RF lines come from"] = "simulated"
+    patient_lies: Annotated[PatientLies, "points that the table hides are asked for last"] = PatientLies.FREE
     recording_path: Annotated[str, "recording to be measured, or to be written (.igs.mha)"] = ""
     speed_of_sound_m_s: Annotated[float, Limits(1300, 1800), "speed of sound in the scalp: mean of the prior"] = (
         EchoSettings.speed_of_sound_m_s
@@ -51,6 +72,7 @@ PANEL = Panel(
             items=(
                 NodeField("OuterTable", "Outer table"),
                 NodeField("LandmarksCT", "Landmarks in the CT"),
+                ParameterField("patient_lies", "The patient lies"),
                 Action("planProtocol", "Plan points", "Place the palpation points", primary=True),
                 ReadOut("currentPoint", "Palpate now", large=True),
                 Action("nextPoint", "Next point", "Go on to the next point", shortcut="Right"),
@@ -82,6 +104,7 @@ PANEL = Panel(
                 Action("startRecording", "Record", "Begin to record lines and poses", primary=True),
                 Action("stopRecording", "Stop the recording", "Finish the file and measure it"),
                 ReadOut("guidance", "Do now", large=True),
+                ReadOut("brings", "Predicted error with this point", "mm"),
                 ReadOut("tilt", "Tilt off the upright", "°", large=True),
                 ReadOut("dwell", "Taken"),
                 Action("undoPoint", "Undo the last point", "Take back the last point", shortcut="Ctrl+Z"),

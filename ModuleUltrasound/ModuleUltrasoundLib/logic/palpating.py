@@ -13,22 +13,21 @@ from CranioNavLib.panel import Level, Reading, StepState, StepStatus, Task
 from CranioNavLib.rigid import invert_rigid, transform_points
 
 from ModuleUltrasoundLib.line_stream import PosedLine
+from ModuleUltrasoundLib.logic.asking import AskStep
 from ModuleUltrasoundLib.logic.measuring import MeasureStep
 from ModuleUltrasoundLib.logic.planning import count_of, registered
-from ModuleUltrasoundLib.logic.probing import ProbeStep
 
 if TYPE_CHECKING:
     from ModuleUltrasoundLib.line_recorder import LineRecorder
     from ModuleUltrasoundLib.palpation import Palpation, PalpationStatus
 
 
-class PalpationStep(ProbeStep, MeasureStep):
+class PalpationStep(AskStep, MeasureStep):
     """Recording, and SurfacePoints as they are taken."""
 
     def __init__(self, parent: Any = None) -> None:
         super().__init__(parent)
         self.recorder: Optional[LineRecorder] = None
-        self._palpation: Optional[Palpation] = None  # which points have been taken, while recording
         self._palpated: Optional[PalpationStatus] = None  # its last status
         self._fedTime = 0.0  # time of the last line that palpation was given
 
@@ -36,20 +35,20 @@ class PalpationStep(ProbeStep, MeasureStep):
         """Ask for a point; where it is expected on the patient follows from the registration, once there is one."""
         super().goTo(index)
         points = scene.find("ProtocolPoints")
-        if self._palpation is None or index < 0 or points is None:
+        if self.palpation is None or index < 0 or points is None:
             return
         expected = None
         if registered():
             target = np.array(points.GetNthControlPointPosition(index))[None]
             expected = transform_points(invert_rigid(scene_data.get_transform("ReferenceToRas")), target)[0]
-        self._palpation.aim(index, expected)
+        self.palpation.aim(index, expected)
 
     def disconnect(self) -> None:
         """Let go of the device; a recording under way is finished."""
         if self.recorder is not None:
             self.closeRecording()
         super().disconnect()
-        self._palpation = None
+        self.palpation = None
 
     # Recording
 
@@ -63,8 +62,8 @@ class PalpationStep(ProbeStep, MeasureStep):
         first = self.latest[-1].line
         self.recorder = LineRecorder(path, first, self.running.acquisition)
         if count_of("ProtocolPoints"):
-            self._palpation, self._fedTime = Palpation(scene_data.get_points("ProtocolPoints").labels), first.host_time_s
-            self.goTo(self.currentIndex())
+            self.palpation, self._fedTime = Palpation(scene_data.get_points("ProtocolPoints").labels), first.host_time_s
+            self.beginAsking()
         return f"recording into {path}" + (f"; the one before is kept as {earlier.name}" if earlier is not None else "")
 
     def startRecordingBlocked(self) -> str:
@@ -95,7 +94,7 @@ class PalpationStep(ProbeStep, MeasureStep):
         if self.recorder is not None:
             self.record(self.poser.ready(everything=True) if self.poser is not None else [])
             self.recorder.close()
-        self.recorder = self._palpation = self._palpated = None
+        self.recorder = self.palpation = self._palpated = None
 
     def measureRecordingBlocked(self) -> str:
         """Why nothing can be measured now."""
@@ -107,20 +106,19 @@ class PalpationStep(ProbeStep, MeasureStep):
         """A point on which the probe has rested long enough is taken, and the next one is asked for."""
         from ModuleUltrasoundLib.palpation import lines_of
 
-        if self._palpation is None or self.measured is None:
+        if self.palpation is None or self.measured is None:
             return
         new = False
         for line in lines_of(self.measured, [item.line.host_time_s for item in self.latest]):
             if line.time_s <= self._fedTime:
                 continue
             self._fedTime = line.time_s
-            self._palpated = self._palpation.add(line)
+            self._palpated = self.palpation.add(line)
             if self._palpated.new_point is not None:
                 new = True
-                if self._palpated.target is not None:
-                    self.goTo(self._palpated.target)
+                self.askNext()
         if new:
-            self._showTaken(self._palpation)
+            self._showTaken(self.palpation)
 
     def _showTaken(self, palpation: Palpation) -> None:
         """The points taken so far as SurfacePoints; measuring the whole recording replaces them at the end."""
@@ -135,11 +133,11 @@ class PalpationStep(ProbeStep, MeasureStep):
 
     def undoPoint(self) -> Optional[str]:
         """Take back the last point and return to it. Returns a message."""
-        point = self._palpation.undo() if self._palpation is not None else None
-        if point is None or self._palpation is None:
+        point = self.palpation.undo() if self.palpation is not None else None
+        if point is None or self.palpation is None:
             return None
         self.goTo(point.target)
-        self._showTaken(self._palpation)
+        self._showTaken(self.palpation)
         return f"{point.label} taken back"
 
     def undoPointBlocked(self) -> str:
@@ -148,7 +146,7 @@ class PalpationStep(ProbeStep, MeasureStep):
 
     def taken(self) -> list[str]:
         """Labels of the points taken in this recording."""
-        return [point.label for point in self._palpation.taken] if self._palpation is not None else []
+        return [point.label for point in self.palpation.taken] if self.palpation is not None else []
 
     # What the panel shows
 
@@ -163,7 +161,7 @@ class PalpationStep(ProbeStep, MeasureStep):
         """The point to palpate now; None once they are measured."""
         if self.recorder is None and count_of("SurfacePoints"):
             return None
-        done = self._palpation is not None and len(self.taken()) >= count_of("ProtocolPoints")
+        done = self.palpation is not None and len(self.taken()) >= count_of("ProtocolPoints")
         return Reading("all are taken", Level.GOOD) if done else super().currentPoint()
 
     def recorded(self) -> Optional[Reading]:

@@ -107,7 +107,9 @@ class ProbeStep(ProtocolStep):
             return
         positions, normals, _ = self.protocolPoints()
         probe_to_ras = scene_data.get_transform("ReferenceToRas") @ pose.matrix
-        self._guide = guide(probe_to_ras, self._surfaceOf(table), positions[index], normals[index])
+        error = scene_data.get_motion_error()
+        rotation = None if error is None else error[0][:3, :3]
+        self._guide = guide(probe_to_ras, self._surfaceOf(table), positions[index], normals[index], rotation)
 
     def _surfaceOf(self, table: Any) -> Surface:
         stamp, surface = self._surface
@@ -165,10 +167,11 @@ class ProbeStep(ProtocolStep):
         return Reading(self._guide.instruction, Level.GOOD if self._guide.on_target and self._guide.aligned else Level.WARNING)
 
     def tilt(self) -> Optional[Reading]:
-        """Angle between the beam and the bone's normal."""
+        """Angle between the beam and the bone's normal, and how well the normal is known under the registration."""
         if self._guide is None:
             return None
-        return Reading(f"{self._guide.angle_deg:.0f}", Level.GOOD if self._guide.aligned else Level.WARNING)
+        known = f" ± {self._guide.angle_sd_deg:.0f}" if np.isfinite(self._guide.angle_sd_deg) else ""
+        return Reading(f"{self._guide.angle_deg:.0f}{known}", Level.GOOD if self._guide.aligned else Level.WARNING)
 
     def deviceStatus(self) -> StepStatus:
         """Whether lines arrive."""

@@ -4,23 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from CranioNavLib.errors import InputError
-from CranioNavLib.rigid import rigid, rigid_from_vector, transform_points
+from CranioNavLib.rigid import rigid
 from CranioNavLib.surface import Surface
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ModuleUltrasoundLib.guidance import (
     bone_normal,
-    choose_next,
     cue,
     direction_in_words,
     guide,
-    motion_rows,
-    reachable,
-    rms_tre_mm,
     screen_axes,
 )
-from ModuleUltrasoundLib.protocol import ProtocolPoints
 from vtkmodules.vtkFiltersSources import vtkSphereSource
 
 CENTER = np.array([10.0, -60.0, 40.0])
@@ -37,83 +31,12 @@ def a_sphere() -> Surface:
     return Surface.from_polydata(source.GetOutput())
 
 
-def points_on_a_sphere(count: int = 12, seed: int = 0) -> ProtocolPoints:
-    normals = np.random.default_rng(seed).normal(size=(count, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    labels = tuple(f"P{k}" for k in range(count))
-    return ProtocolPoints(labels, CENTER + 80 * normals * (1.0, 1.2, 0.9), normals, labels)
-
-
-def a_covariance(seed: int = 0) -> np.ndarray:
-    root = np.random.default_rng(seed).normal(size=(6, 6)) * [0.02, 0.02, 0.02, 1.5, 1.5, 1.5]
-    return root.T @ root + np.diag([1e-6] * 3 + [1e-3] * 3)
-
-
 def a_pose(contact: np.ndarray, back: np.ndarray, off: float = 20.0) -> np.ndarray:
     """A probe `off` mm before a contact, its back end towards `back`."""
     z = -back / np.linalg.norm(back)
     x = np.cross(z, [0.3, 0.5, 0.8])
     x /= np.linalg.norm(x)
     return rigid(np.column_stack([x, np.cross(z, x), z]), contact - off * z)
-
-
-# Which point next
-
-
-def test_a_motions_row_is_the_change_of_the_distance_along_the_normal():
-    points, rng = points_on_a_sphere(), np.random.default_rng(1)
-    rotation, shift = 1e-5 * rng.normal(size=3), 1e-4 * rng.normal(size=3)
-    moved = transform_points(rigid_from_vector(rotation, shift, CENTER), points.positions_ras_mm)
-    change = np.sum((moved - points.positions_ras_mm) * points.normals, axis=1)
-    rows = motion_rows(points.positions_ras_mm, points.normals, CENTER)
-    assert rows @ np.concatenate([rotation, shift]) == pytest.approx(change, abs=1e-7)
-
-
-def test_predicted_tre_agrees_with_motions_drawn_at_random():
-    covariance, targets = a_covariance(), CENTER + np.random.default_rng(2).normal(size=(5, 3)) * 40
-    motions = np.random.default_rng(3).multivariate_normal(np.zeros(6), covariance, size=40000)
-    arms = targets - CENTER
-    errors = np.cross(motions[:, None, :3], arms[None]) + motions[:, None, 3:]
-    assert rms_tre_mm(covariance, CENTER, targets) == pytest.approx(np.sqrt(np.mean(np.sum(errors**2, axis=2))), rel=0.015)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_next_point_is_the_one_that_full_least_squares_would_choose(seed):
-    points, covariance, targets = points_on_a_sphere(seed=seed), a_covariance(seed), CENTER + 50 * np.eye(3)
-    free = np.arange(12) % 3 != 0
-    expected = np.full(12, np.inf)
-    for index in np.flatnonzero(free):
-        row = motion_rows(points.positions_ras_mm[index : index + 1], points.normals[index : index + 1], CENTER)
-        after = np.linalg.inv(np.linalg.inv(covariance) + row.T @ row / 0.6**2)
-        expected[index] = rms_tre_mm(after, CENTER, targets)
-    chosen = choose_next(points, free, covariance, CENTER, targets, 0.6)
-    assert chosen.index == int(np.argmin(expected))
-    assert chosen.label == points.labels[chosen.index]
-    assert chosen.tre_then_mm == pytest.approx(expected.min(), rel=1e-6)
-    assert chosen.tre_then_mm < chosen.tre_now_mm == pytest.approx(rms_tre_mm(covariance, CENTER, targets))
-
-
-def test_there_is_no_next_point_when_none_is_open():
-    assert choose_next(points_on_a_sphere(), np.zeros(12, dtype=bool), a_covariance(), CENTER, CENTER[None]) is None
-
-
-def test_a_covariance_that_is_none_is_refused():
-    for bad in (np.eye(3), np.full((6, 6), np.nan), -np.eye(6)):
-        with pytest.raises(InputError, match="register the landmarks first"):
-            choose_next(points_on_a_sphere(), np.ones(12, dtype=bool), bad, CENTER, CENTER[None])
-
-
-def test_points_under_the_clamp_and_on_the_table_are_out_of_reach():
-    normals = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0], [0, 0, 1.0]])
-    points = ProtocolPoints(("right", "front", "back", "top"), 80 * normals, normals, ("",) * 4)
-    pin = np.array([[110.0, 20.0, 0.0]])  # beside a probe on the right, not in its foot
-    assert reachable(points, pin).tolist() == [False, True, True, True]
-    assert reachable(points, None, (0.0, -1.0, 0.0)).tolist() == [True, True, False, True]
-    assert reachable(points, pin + (0.0, 20.0, 0.0)).all()
-    assert reachable(points).all()
-
-
-# How the probe stands
 
 
 @settings(max_examples=30, deadline=None)

@@ -15,6 +15,7 @@ from CranioNavLib.rigid import rigid, rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition, read_recording
 from CranioNavLib.slicer_files import LabelledPoints, load_scene, save_scene
 from CranioNavLib.surface import Surface
+from ModuleUltrasoundLib import panel_description as module_panel
 from ModuleUltrasoundLib.device import AMODE_DEVICES, AModeDevice, RfLine
 
 import ModuleUltrasound as module
@@ -239,6 +240,57 @@ def test_resting_on_a_point_takes_it_and_asks_for_the_next(a_recording_logic):
     assert logic.undoPoint() == f"{label} taken back"
     assert logic.currentIndex() == 0
     assert scene.find("SurfacePoints") is None
+
+
+def know_the_error(logic):
+    """The registration in force turns loosely about the left-right axis, and is sure of all else."""
+    scene_data.set_motion_error(np.diag([0.05, 0.002, 0.002, 0.3, 0.3, 0.3]) ** 2, np.zeros(3), None)
+    logic.closeRecording()
+    run_for(logic, 0.3, on_point(logic, 0))
+    logic.startRecording()
+
+
+def test_the_point_that_shrinks_the_error_most_is_asked_for_first(a_recording_logic):
+    logic = a_recording_logic
+    know_the_error(logic)
+    positions, normals, _ = logic.protocolPoints()
+    arms = np.abs(np.cross(positions, normals)[:, 0])  # of a turn about the left-right axis
+    assert arms[logic.currentIndex()] > 0.9 * arms.max()
+    before, after = map(float, logic.brings().text.split(" → "))
+    assert after < before
+    first = logic.currentIndex()
+    logic.nextPoint()
+    assert logic.currentIndex() != first
+    asked = {first, logic.currentIndex()}
+    for _ in range(16):
+        logic.nextPoint()
+        asked.add(logic.currentIndex())
+    assert asked == set(range(18))  # each once, before one that was left out is asked for again
+
+
+def test_points_that_the_table_hides_are_asked_for_last(a_recording_logic):
+    logic = a_recording_logic
+    logic.parameters().change(patient_lies=module_panel.PatientLies.LEFT)
+    know_the_error(logic)
+    normals, order = logic.protocolPoints()[1], [logic.currentIndex()]
+    for _ in range(17):
+        logic.nextPoint()
+        order.append(logic.currentIndex())
+    hidden = (normals @ [-1.0, 0, 0] >= np.cos(np.radians(50)))[order]
+    assert hidden.any()
+    assert not hidden[: (~hidden).sum()].any()
+
+
+def test_a_point_where_the_reference_base_stands_is_asked_for_last(a_recording_logic):
+    logic = a_recording_logic
+    know_the_error(logic)
+    first = logic.currentIndex()
+    positions, normals, _ = logic.protocolPoints()
+    base = np.eye(4)
+    base[:3, 3] = positions[first] + 60 * normals[first]  # in the way of a probe on that point
+    scene_data.set_transform("ReferenceToRas", base)
+    logic.beginAsking()
+    assert logic.currentIndex() != first
 
 
 def test_a_probe_far_from_the_point_takes_nothing_and_is_told_so(a_recording_logic):

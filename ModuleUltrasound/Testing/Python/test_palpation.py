@@ -7,12 +7,14 @@ import pytest
 from CranioNavLib.errors import InputError
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ModuleUltrasoundLib.measure import LineMeasurements
 from ModuleUltrasoundLib.palpation import (
     Palpation,
     PalpationLine,
     PalpationSettings,
     PalpationState,
     Sweep,
+    lines_of,
     to_bone_points,
 )
 
@@ -84,7 +86,6 @@ def test_lines_that_are_not_good_never_make_a_point_and_say_why(bad, reason):
         assert status.reason == reason
         assert status.state is PalpationState.WAITING
     assert palpation.taken == ()
-    assert palpation.why_not() == reason
 
 
 def test_a_moving_probe_makes_no_point():
@@ -156,16 +157,6 @@ def test_undo_returns_to_the_last_point():
         palpation.undo()
     assert palpation.undo() is None
     assert palpation.target == 0
-
-
-def test_a_skipped_point_is_left_out():
-    palpation = Palpation(LABELS)
-    palpation.skip()
-    assert palpation.target == 1
-    assert palpation.open_points == [False, True, True]
-    rest(palpation, (0, 0, 0), 0.0)
-    palpation.skip()
-    assert palpation.target is None
 
 
 def test_points_that_do_not_exist_are_refused():
@@ -244,3 +235,26 @@ def test_lines_become_bone_points_with_all_that_is_known():
     assert points.at_speed(1515.0).positions_mm[0] == pytest.approx([1, 2, 3 - 5.0 * 0.01])
     with pytest.raises(InputError, match="palpate before registering"):
         to_bone_points([])
+
+
+def test_measured_frames_become_lines():
+    measured = LineMeasurements(
+        depths_mm=np.array([5.0, np.nan]),
+        depth_sds_mm=np.array([0.1, np.nan]),
+        positions_mm=np.array([[1.0, 2, 3], [np.nan] * 3]),
+        covariances_mm2=np.tile(np.eye(3), (2, 1, 1)),
+        beam_directions=np.tile([0.0, 0, 1], (2, 1)),
+        qualities=np.array([0.97, 0.0]),
+        accepted=np.array([True, False]),
+        reasons=("", "no echo"),
+        alternative_depths_mm=np.empty((2, 0)),
+        alternative_probabilities=np.empty((2, 0)),
+        skin_times_s=np.zeros(2),
+        speed_of_sound_m_s=1540.0,
+        speed_of_sound_sd_m_s=52.0,
+    )
+    good, bad = lines_of(measured, [10.0, 10.1], first_frame=40)
+    assert (good.accepted, good.quality, good.depth_mm, good.frame, good.time_s) == (True, 0.97, 5.0, 40, 10.0)
+    assert (bad.accepted, bad.reason, bad.frame) == (False, "no echo", 41)
+    with pytest.raises(InputError, match="one time for each of 2"):
+        lines_of(measured, [1.0])

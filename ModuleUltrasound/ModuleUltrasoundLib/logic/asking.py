@@ -1,0 +1,100 @@
+"""Which point is asked for next: the one that shrinks the predicted TRE most, those out of reach last."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Optional
+
+import numpy as np
+import numpy.typing as npt
+from CranioNavLib import scene_data
+from CranioNavLib.panel import Reading
+
+from ModuleUltrasoundLib.logic.planning import count_of, registered
+from ModuleUltrasoundLib.logic.probing import ProbeStep
+from ModuleUltrasoundLib.panel_description import TOWARDS_TABLE
+
+if TYPE_CHECKING:
+    from ModuleUltrasoundLib.next_point import NextTarget
+    from ModuleUltrasoundLib.palpation import Palpation
+    from ModuleUltrasoundLib.protocol import ProtocolPoints
+
+
+class AskStep(ProbeStep):
+    """The order of the points while they are palpated."""
+
+    def __init__(self, parent: Any = None) -> None:
+        super().__init__(parent)
+        self.palpation: Optional[Palpation] = None  # which points have been taken, while recording
+        self._passed: set[int] = set()  # left out for now: they come again after the others
+        self._brings: Optional[NextTarget] = None  # what the point asked for is expected to bring
+
+    def beginAsking(self) -> None:
+        """Every point is open again."""
+        self._passed.clear()
+        self.askNext()
+
+    def askNext(self) -> None:
+        """Go to the point that brings most; in the protocol's order while no registration tells which that is."""
+        palpation, plan = self.palpation, self._plan()
+        if palpation is None:
+            return
+        is_open = np.array(palpation.open_points)
+        if not (is_open & ~self._left_out(len(plan))).any():
+            self._passed.clear()
+        candidates = is_open & ~self._left_out(len(plan))
+        within = candidates & self._within_reach(plan)
+        candidates = within if within.any() else candidates
+        if not candidates.any():
+            return
+        self._brings = self._best(plan, candidates, [point.target for point in palpation.taken])
+        if self._brings is not None:
+            self.goTo(self._brings.index)
+            return
+        order = (max(self.currentIndex(), 0) + np.arange(len(plan))) % len(plan)
+        self.goTo(int(order[candidates[order]][0]))
+
+    def nextPoint(self) -> None:
+        """Leave the present point out for now; while recording it is asked for again after the others."""
+        if self.palpation is None:
+            super().nextPoint()
+            return
+        self._passed.add(self.currentIndex())
+        self.askNext()
+
+    def brings(self) -> Optional[Reading]:
+        """What the point asked for is expected to do to the error at the targets."""
+        best, palpation = self._brings, self.palpation
+        if best is None or palpation is None or best.index != self.currentIndex() or not any(palpation.open_points):
+            return None
+        return Reading(f"{best.tre_now_mm:.1f} → {best.tre_then_mm:.1f}")
+
+    def _left_out(self, count: int) -> npt.NDArray[np.bool_]:
+        return np.isin(np.arange(count), list(self._passed))
+
+    def _plan(self) -> ProtocolPoints:
+        from ModuleUltrasoundLib.protocol import ProtocolPoints
+
+        positions, normals, labels = self.protocolPoints()
+        return ProtocolPoints(labels, positions, normals, labels)
+
+    def _within_reach(self, plan: ProtocolPoints) -> npt.NDArray[np.bool_]:
+        """The reference base stands on the head clamp: a probe that would run into it cannot be held there."""
+        from ModuleUltrasoundLib.next_point import reachable
+
+        clamp = scene_data.get_transform("ReferenceToRas")[:3, 3][None] if registered() else None
+        return reachable(plan, clamp, TOWARDS_TABLE[self.parameters().read().patient_lies])
+
+    def _best(self, plan: ProtocolPoints, candidates: npt.NDArray[np.bool_], taken: list[int]) -> Optional[NextTarget]:
+        """By the error of the registration in force, with the points taken since counted in; None where it is not known."""
+        from ModuleUltrasoundLib.next_point import DEFAULTS, choose_next, covariance_with
+
+        error = scene_data.get_motion_error() if registered() else None
+        if error is None:
+            return None
+        covariance, pivot, _ = error
+        for index in taken:
+            covariance = covariance_with(
+                covariance, plan.positions_ras_mm[index], plan.normals[index], pivot, DEFAULTS.point_sd_mm
+            )
+        targets = scene_data.get_points("TargetsCT").positions_mm if count_of("TargetsCT") else plan.positions_ras_mm
+        return choose_next(plan, candidates, covariance, pivot, targets)
