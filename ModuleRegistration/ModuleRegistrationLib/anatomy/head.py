@@ -22,6 +22,9 @@ REGROW_MM = 5.0  # how far the cut is undone along the tissue, so that nose and 
 ORIFICE_MM = 7.5  # nostrils and ear canals up to twice this wide are closed
 SINUS_MM2 = 4000.0  # an air space within one slice up to this area belongs to the head (a nasal cavity has about 1500)
 SMALLEST_HEAD_ML, LARGEST_HEAD_ML = 150.0, 20000.0  # a slab of a small head; a head with shoulders
+MOST_AIR_ML = 2500.0  # the empty cranium of a dry skull or a phantom holds up to 1900 ml, the lungs of a breath held 3000 and more
+    2500.0  # the empty cranium of a dry skull or a phantom holds up to 1900 ml; lungs at the breath of a CT 3000 and more
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +66,7 @@ def find_head(volume: Volume) -> Head:
     Raises
     ------
     InputError
-        Nothing of a head's size is denser than air.
+        Nothing of a head's size is denser than air, or it encloses lungs.
     """
     full = Grid.of(volume)
     strides = full.strides(COARSE_MM)
@@ -88,6 +91,11 @@ def find_head(volume: Volume) -> Head:
             f"({', '.join(f'{s:.2f}' for s in full.spacing_mm[::-1])} mm) and give a CT of the head"
         )
     mask = _fill(_dilated(core, NECK_MM + REGROW_MM, grid, tissue), grid)
+    air_ml = float((subsampled(volume.hu, strides)[mask] < 2 * AIR_TISSUE_HU).sum()) * grid.voxel_mm3 / 1000
+    if air_ml > MOST_AIR_ML:
+        raise InputError(
+            f"the CT is no head: its tissue encloses {air_ml / 1000:.1f} l of air, as a chest does; give a CT of the head"
+        )
     half = np.float32(spacing.mean() / 2)  # distances are between the cells' centres, the skin is half way
     depth = np.where(mask, distance_to(~mask, spacing) - half, half - distance_to(mask, spacing))
     return Head(grid, mask, depth.astype(np.float32, copy=False))

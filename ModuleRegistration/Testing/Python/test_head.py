@@ -67,6 +67,15 @@ def test_two_metres_of_tissue_are_no_head():
         find_head(Volume(hu, np.diag([8.0, 8.0, 8.0, 1.0])))
 
 
+def test_a_chest_is_no_head():
+    z, y, x = np.indices((60, 90, 130)) * 3.0
+    body = np.hypot((x - 195) / 160, (y - 135) / 110) < 1
+    lungs = np.hypot((np.abs(x - 195) - 75) / 60, (y - 135) / 75) < 1
+    hu = np.where(lungs & (z > 12) & (z < 165), -780, np.where(body, 40, -1000)).astype(np.int16)
+    with pytest.raises(InputError, match=r"encloses 4\.\d l of air, as a chest does; give a CT of the head"):
+        find_head(Volume(hu, np.diag([3.0, 3.0, 3.0, 1.0])))
+
+
 def test_a_volume_without_air_is_refused(a_shell):
     with pytest.raises(InputError, match="shows no air"):
         find_head(Volume(a_shell().hu[20:30, 80:120, 80:120], np.eye(4)))
