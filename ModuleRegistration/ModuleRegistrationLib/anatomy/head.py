@@ -22,9 +22,7 @@ REGROW_MM = 5.0  # how far the cut is undone along the tissue, so that nose and 
 ORIFICE_MM = 7.5  # nostrils and ear canals up to twice this wide are closed
 SINUS_MM2 = 4000.0  # an air space within one slice up to this area belongs to the head (a nasal cavity has about 1500)
 SMALLEST_HEAD_ML, LARGEST_HEAD_ML = 150.0, 20000.0  # a slab of a small head; a head with shoulders
-MOST_AIR_ML = 2500.0  # the empty cranium of a dry skull or a phantom holds up to 1900 ml, the lungs of a breath held 3000 and more
-    2500.0  # the empty cranium of a dry skull or a phantom holds up to 1900 ml; lungs at the breath of a CT 3000 and more
-)
+MOST_AIR_ML = 2500.0  # the empty cranium of a dry skull holds up to 1900 ml, the lungs of a breath held 3000 and more
 
 
 @dataclass(frozen=True, eq=False)
