@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import itertools
 import logging
+import time
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from Workstation.web.session_files_view import FilesDialog
 from Workstation.web.session_folder import SessionFolder, new_folder
 from Workstation.web.session_panel import SessionLogic
 from Workstation.web.session_windows import Windows
+from Workstation.web.sharpness import Sharpness, resize_slice
 from Workstation.web.sounds import Cues, situation
 from Workstation.web.tool_models import registered
 from Workstation.web.view_controls import ViewControls, layout_grid
@@ -36,6 +38,7 @@ from Workstation.web.views import ViewFollower
 
 POLL_S = 0.02  # a pose waits for half of it on average
 REFRESH_EVERY = 8  # polls between two looks at the read-outs
+STANDS_S = 0.6  # without a new pose: nothing moves
 SAVE_EVERY = 50  # polls between two looks at what is to be saved
 PICTURE_QUALITY = 90  # JPEG; one quality for moving and still pictures, so that none is sent twice
 LOG = logging.getLogger(__name__)
@@ -67,6 +70,7 @@ class WorkstationApp(TrameApp):
                 self.server, model, key, self.places.shown, self.places.meant, self.places.typed, self._poll
             )
         self._place: tuple[Any, ...] = ()  # that the slices show
+        self._moved_s, self._sharpness = 0.0, Sharpness(self._sharpen)
         self._in_turn = itertools.cycle(self.panels)  # of panels that are not shown, one at a time is looked at
         self._use_folder()
         self.views, self.cues = ViewFollower(self.slicer), Cues()
@@ -103,7 +107,7 @@ class WorkstationApp(TrameApp):
 
         self.slicer = SlicerApp()
         host.adopt_scene(self.slicer.scene, self.slicer.app_logic)
-        register_quiet_factories(self.slicer.view_manager, self.server, self.sliders)
+        self._slices, _ = register_quiet_factories(self.slicer.view_manager, self.server, self.sliders)
         self.layouts = LayoutManager(self.slicer.scene, self.slicer.view_manager, self.server)
         # the views are made here: made inside the page, their widgets would land between the page's own
         self.layouts.register_layout_dict(layout_grid())
@@ -116,6 +120,12 @@ class WorkstationApp(TrameApp):
         for view in manager.get_threed_views():
             still = MovingPicture(view, lambda: self.views.moving_models())
             pace(view, get_view_trame_id(self.server, view), self.painter, PICTURE_QUALITY, still)
+
+    def _sharpen(self, share: float) -> None:
+        """Another number of pixels for the slices."""
+        for view in self._slices.get_views():
+            resize_slice(view, self._slices.get_factory_view(view.get_singleton_tag()).view_adapter, share)
+        self._place = ()
 
     def _use_folder(self) -> None:
         """The modules write into the session's folder unless the user says otherwise."""
@@ -161,18 +171,22 @@ class WorkstationApp(TrameApp):
         self.views.show_tools(self._forerun_mm())
         place = self._followed()
         if place != self._place:
-            with self.painter.while_moving():
-                for view in self.slicer.view_manager.get_views():
-                    view.schedule_render()
+            self._draw_moving()
+
+    def _draw_moving(self) -> None:
+        with self.painter.while_moving():
+            for view in self.slicer.view_manager.get_views():
+                view.schedule_render()
 
     def _lead(self) -> None:
         """Just before the views are painted: the newest poses, and the slices where the leading tool is now."""
         self._poll()
         place = self._followed()
         if place != self._place:
-            self._place = place
+            self._place, self._moved_s = place, time.monotonic()
             with self.painter.while_moving():
                 self._navigate()
+            self._draw_moving()
 
     def _followed(self) -> tuple[Any, ...]:
         """What the slices follow in navigation."""
@@ -184,6 +198,8 @@ class WorkstationApp(TrameApp):
 
     def _turn(self, turn: int) -> None:
         if turn % REFRESH_EVERY == 0:
+            now_s = time.monotonic()
+            self._sharpness.look(now_s, self.painter.late_s, bool(self._place) and now_s < self._moved_s + STANDS_S)
             with self.server.state as state:
                 self._refresh_views(state)
                 self.sliders.refresh()

@@ -31,10 +31,13 @@ class Painter:
     def __init__(self, pictures: Pictures) -> None:
         self.muted = False  # requests are dropped: what changes now is not drawn
         self.moving = False  # requests come from tools that move; all else stands still
+        self.late_s = 0.0  # how long after it could have begun a round begins, on average of the last ones
         self.before_round: Callable[[], None] = bool
         self.pictures = pictures
         pictures.freed = self.wake
         self._wanted: dict[str, PacedRendering] = {}
+        self._known: dict[str, PacedRendering] = {}  # all that ever asked
+        self._asked_s = 0.0  # the first of the requests that wait
         self._news: asyncio.Event | None = None
 
     @contextmanager
@@ -48,7 +51,9 @@ class Painter:
 
     def ask(self, name: str, view: PacedRendering) -> None:
         """A view wants to be painted."""
-        self._wanted[name] = view
+        if not self._wanted:
+            self._asked_s = time.monotonic()
+        self._wanted[name] = self._known[name] = view
         self.pictures.outdated(name)
         self.wake()
 
@@ -68,7 +73,9 @@ class Painter:
                     await asyncio.wait_for(self._news.wait(), PATIENCE_S)
                 continue
             await asyncio.sleep(max(0.0, next_s - time.monotonic()))
-            next_s = time.monotonic() + FASTEST_S
+            begun_s = time.monotonic()
+            self.late_s += 0.1 * (min(begun_s - max(self._asked_s, next_s), PATIENCE_S) - self.late_s)
+            next_s = begun_s + FASTEST_S
             self._attempt(self.before_round)
             for name in self._ready():
                 self._attempt(self._wanted.pop(name).paint)
@@ -84,8 +91,7 @@ class Painter:
     def _soon(self) -> bool:
         """Whether a view that was painted just now will take another picture in a moment: then all are painted together."""
         now_s = time.monotonic()
-        late = (view for view in self._wanted.values() if now_s < view.painted_s + PATIENCE_S)
-        return any(not self._takes(view) for view in late)
+        return any(now_s < view.painted_s + PATIENCE_S and not self._takes(view) for view in self._known.values())
 
     def _attempt(self, what: Callable[[], None]) -> None:
         try:
@@ -150,14 +156,17 @@ def pixels_of(window: Any) -> Any:
     return vtk_to_numpy(image.GetPointData().GetScalars()).reshape(height, width, 3)
 
 
-def register_quiet_factories(view_manager: Any, server: Any, sliders: SliceSliders) -> None:
-    """Views for the page that do not render while they are made, as nobody looks at them yet."""
+def register_quiet_factories(view_manager: Any, server: Any, sliders: SliceSliders) -> list[Any]:
+    """Views for the page that do not render while they are made, as nobody looks at them yet. Returns slices' and 3-D's."""
+    factories = []
     for kind, view_type, controls in (
         (SliceView, ViewType.SLICE_VIEW, partial(slice_frame, sliders)),
         (ThreeDView, ViewType.THREE_D_VIEW, threed_frame),
     ):
         quiet = partial(kind, scheduled_render_strategy=ScheduledRenderStrategy())
-        view_manager.register_factory(RemoteViewFactory(server, quiet, view_type, populate_view_ui_f=controls))
+        factories.append(RemoteViewFactory(server, quiet, view_type, populate_view_ui_f=controls))
+        view_manager.register_factory(factories[-1])
+    return factories
 
 
 def pace(view: Any, area: str, painter: Painter, quality: int, source: Any = None) -> None:
