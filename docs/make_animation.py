@@ -13,6 +13,7 @@ import io
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZE = (1024, 640)
-LONG_S, SHORT_S = 1.6, 0.4  # how long a still picture is shown, and one of a movement
+LONG_S, SHORT_S = 1.6, 0.45  # how long a still picture is shown, and one of a movement
+LONGEST_S = 240.0  # of a movement, on a busy machine
 QUALITY = 55
 
 
@@ -33,8 +35,11 @@ class Film:
         self.seconds: list[float] = []
         self._last = b""
 
-    def take(self, seconds: float = LONG_S) -> None:
-        """One picture."""
+    def take(self, seconds: float = LONG_S, patience_s: float = 20.0) -> None:
+        """One picture, once the views are up to date; where they do not become so in time, as they are."""
+        until = time.monotonic() + patience_s
+        while self._page.locator("[data-behind]:visible").count() and time.monotonic() < until:
+            self._page.wait_for_timeout(50)
         shot = self._page.screenshot(type="png")
         if shot == self._last:
             self.seconds[-1] += seconds
@@ -43,92 +48,112 @@ class Film:
         self.pictures.append(Image.open(io.BytesIO(shot)).convert("RGB").resize(SIZE, Image.Resampling.LANCZOS))
         self.seconds.append(seconds)
 
-    def take_several(self, count: int, every_s: float) -> None:
-        """Pictures of a movement."""
-        for _ in range(count):
-            begun = time.monotonic()
-            self.take(SHORT_S)
-            self._page.wait_for_timeout(max(0.0, 1000 * (every_s - (time.monotonic() - begun))))
+    def take_until(self, over: Callable[[], bool], every_s: float, most: int, seconds: float = SHORT_S) -> None:
+        """Pictures of a movement until it is over; `most` of them are kept, evenly spread."""
+        first, begun = len(self.pictures), time.monotonic()
+        while not over() and time.monotonic() < begun + LONGEST_S:
+            self.take(seconds, patience_s=1.0)
+            self._page.wait_for_timeout(1000 * every_s)
+        kept = sorted({round(first + i * (len(self.pictures) - 1 - first) / (most - 1)) for i in range(most)})
+        self.pictures[first:] = [self.pictures[i] for i in kept]
+        self.seconds[first:] = [seconds for _ in kept]
 
     def save(self, path: Path) -> None:
         """As an animated WebP that repeats."""
         durations = [round(1000 * seconds) for seconds in self.seconds]
         self.pictures[0].save(
-            path, save_all=True, append_images=self.pictures[1:], duration=durations, loop=0, quality=QUALITY, method=2
+            path, save_all=True, append_images=self.pictures[1:], duration=durations, loop=0, quality=QUALITY, method=4
         )
+
+
+def follow(user: Any, step: str, action: str) -> None:
+    """Press the bright button of the open step once it is this one."""
+    user.page.locator(f"[data-panel={step}] [data-offer={action}]").click()
+
+
+def is_offered(user: Any, step: str, action: str) -> bool:
+    """Whether that is the bright button now."""
+    return bool(user.page.locator(f"[data-panel={step}] [data-offer={action}]").count())
 
 
 def prepare(user: Any, film: Film) -> None:
     """CT, bone, devices, calibration."""
     film.take()
     user.press("ct", "layPatient")
-    user.sees("ct", "simulated patient: ")
+    user.sees("ct", "Done")
     user.page.wait_for_timeout(2000)
-    film.take()
+    film.take(2.0)
     user.next("ct")
-    user.press("bone", "segmentBone")
     film.take(1.0)
-    user.sees("bone", "on the outer table")
+    follow(user, "bone", "segmentBone")
+    user.sees("bone", "Done")
     user.page.wait_for_timeout(2500)
-    film.take()
+    film.take(2.0)
     user.next("bone")
-    user.press("devices", "connect", 0)
-    user.sees("devices", r"\d+ frames a second")
-    user.press("devices", "connect", 1)
-    user.sees("devices", r"[1-9]\d* lines")
-    film.take_several(3, 1.0)
+    for _ in ("tracker", "probe"):
+        film.take(1.0)
+        follow(user, "devices", "connect")
+        user.page.wait_for_timeout(2500)
+    user.sees("devices", "Done")
+    film.take(2.0)
     user.next("devices")
-    user.press("calibration", "pivotStylus")
+    film.take(1.0)
+    follow(user, "calibration", "pivotStylus")
     user.page.wait_for_timeout(2500)
-    user.press("calibration", "startPivot")
-    film.take_several(5, 1.5)
-    user.sees("calibration", r"SD \d+\.\d+ mm")
+    follow(user, "calibration", "startPivot")
+    film.take_until(lambda: "SD " in user.page.inner_text("[data-panel=calibration]"), 0.5, most=6)
     film.take()
 
 
 def register(user: Any, film: Film) -> None:
     """Landmarks, then ultrasound."""
     user.next("calibration")
-    film.take()
-    user.digitise_landmarks()
-    film.take()
-    user.press("landmarks", "registerLandmarks")
-    user.sees("landmarks", r"4 landmark pairs, FRE \d")
-    user.page.wait_for_timeout(1500)
-    film.take(2.0)
-    user.next("landmarks")
-    user.press("ultrasound", "planProtocol")
-    user.sees("ultrasound", "18 points")
-    user.press("ultrasound", "startRecording")
-    user.press("ultrasound", "palpateAll")
-    film.take_several(36, 2.0)
-    user.sees("ultrasound", r"1[5-8] of 18 points")
-    user.press("ultrasound", "stopRecording")
-    user.sees("ultrasound", r"\d+ bone points from")
-    film.take()
-    user.press("ultrasound", "registerSurface")
+    for number in range(4):
+        if number < 2:
+            film.take(1.0)
+        follow(user, "landmarks", "touchNextLandmark")
+        while not is_offered(user, "landmarks", "touchNextLandmark") and not is_offered(user, "landmarks", "registerLandmarks"):
+            if is_offered(user, "landmarks", "digitise"):
+                user.page.wait_for_timeout(1000)
+                follow(user, "landmarks", "digitise")
+            user.page.wait_for_timeout(1500)
     film.take(1.0)
-    user.sees("ultrasound", "(accepted|warning) after")
-    user.page.wait_for_timeout(2000)
+    follow(user, "landmarks", "registerLandmarks")
+    user.sees("landmarks", "Done")
+    user.page.wait_for_timeout(2500)
+    film.take(2.5)
+    user.next("landmarks")
+    film.take(1.0)
+    follow(user, "ultrasound", "planProtocol")
+    follow(user, "ultrasound", "startRecording")
+    follow(user, "ultrasound", "palpateAll")
+    film.take_until(lambda: is_offered(user, "ultrasound", "stopRecording"), 0.8, most=34)
+    film.take()
+    follow(user, "ultrasound", "stopRecording")
+    follow(user, "ultrasound", "registerSurface")
+    user.sees("ultrasound", "Done")
+    user.page.wait_for_timeout(3000)
     film.take(3.0)
 
 
 def finish(user: Any, film: Film) -> None:
     """Verification, navigation, report."""
     user.next("ultrasound")
-    user.press("verification", "measureTargets")
-    user.press("verification", "verify")
-    user.sees("verification", r"TRE \d+\.\d+ mm \(mean\)")
-    user.page.wait_for_timeout(1500)
+    film.take(1.0)
+    follow(user, "verification", "measureTargets")
+    follow(user, "verification", "verify")
+    user.sees("verification", "Done")
+    user.page.wait_for_timeout(2000)
     film.take(3.0)
     user.next("verification")
-    user.press("navigation", "tourTargets")
+    follow(user, "navigation", "tourTargets")
     user.sees("navigation", r"To the bone\s+\d+\.\d mm")
-    film.take_several(24, 0.8)
+    film.take_until(lambda: is_offered(user, "navigation", "tourTargets"), 0.4, most=26)
     user.next("navigation")
-    user.press("report", "writeReport")
     film.take(1.0)
-    user.sees("report", "written; ")
+    follow(user, "report", "writeReport")
+    user.sees("report", "Done")
+    user.page.wait_for_timeout(1500)
     film.take(3.0)
 
 

@@ -75,7 +75,7 @@ def register(user):
     user.press("ultrasound", "stopRecording")
     user.sees("ultrasound", r"\d+ bone points from")
     user.press("ultrasound", "registerSurface")
-    user.sees("ultrasound", "(accepted|warning) after")
+    user.sees("ultrasound", "(accepted|warning): ")
     user.picture("6-registered")
     user.next("ultrasound")
 

@@ -265,3 +265,20 @@ def test_without_three_slices_there_is_no_crossing(an_empty_scene, monkeypatch):
     for nodes in ([], [node], [node] * 3):
         monkeypatch.setattr(slice_views, "slice_nodes", lambda nodes=nodes: nodes)
         assert slice_views.crossing() is None
+
+
+def test_the_lit_grey_window_is_the_one_that_the_slices_have(an_empty_scene):
+    from CranioNavLib.volume import Volume
+
+    from Workstation.web.view_controls import ViewControls
+
+    server = SimpleNamespace(state=SimpleNamespace(), controller=SimpleNamespace(trigger=lambda name: lambda function: None))
+    controls = ViewControls(server, None, lambda: None)
+    display = scene_data.set_volume("CT", Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), "nothing")).GetDisplayNode()
+    display.SetWindowLevel(1500.0, 300.0)  # as dragging does
+    controls.look()
+    assert server.state.window == ""
+    controls.show_window("bone")
+    assert (display.GetWindow(), display.GetLevel()) == (2000.0, 400.0)
+    controls.look()
+    assert server.state.window == "bone"

@@ -202,6 +202,7 @@ class WorkstationApp(TrameApp):
             self._sharpness.look(now_s, self.painter.late_s, bool(self._place) and now_s < self._moved_s + STANDS_S)
             with self.server.state as state:
                 self._refresh_views(state)
+                self.controls.look()
                 self.sliders.refresh()
                 if state.step in ("devices", "ultrasound"):
                     state.live = drawings(self.logics[ULTRASOUND])

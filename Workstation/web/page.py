@@ -40,6 +40,7 @@ html { overflow: hidden; }
 .buttons .v-btn { height: auto; min-height: 38px; padding: 6px 8px; }
 .buttons .v-btn__content { white-space: normal; line-height: 1.15; }
 .headline .v-alert { border-radius: 4px; }
+.v-messages__message { line-height: 1.3; }
 .said { overflow-wrap: anywhere; max-height: 7.5em; overflow-y: auto; }
 .part { border-top: 1px solid rgba(255, 255, 255, 0.12); padding-top: 12px; margin-top: 12px; }
 """
@@ -126,7 +127,7 @@ class Page:
             texts = f"[{', '.join(self._statuses(step))}].map(one => one.text).filter(Boolean)[0]"
             now = f"'{words.NOW}' + ({self._waiting(step)}.text || '{words.SEE_BELOW}')"
             html.Div(f"{{{{ {done} ? '{words.DONE} ' + ({texts} || '') : {now} }}}}", v_if=f"!({busy})", classes="text-body-1")
-            self._draw_offer(step, done)
+            self._draw_offer(step, done, busy)
             if step.name == "ct":
                 draw_files(f"!({done} || {busy})", f"!{self._offer(step)}")
             for module in dict.fromkeys(module for module, _ in step.parts):
@@ -134,11 +135,11 @@ class Page:
                 self.panels[module].draw_said(parts)
             self._draw_ways(step, before, after, done)
 
-    def _draw_offer(self, step: ProcedureStep, done: str) -> None:
+    def _draw_offer(self, step: ProcedureStep, done: str, busy: str) -> None:
         """The button to press now; where all is done what the simulated hand may still show."""
         v3.VBtn(
             "{{ one.label }}",
-            v_for=f"one in {self._offer(step)} ? [{self._offer(step)}] : []",
+            v_for=f"one in !({busy}) && {self._offer(step)} ? [{self._offer(step)}] : []",
             key="one.name",
             block=True,
             classes="my-2",

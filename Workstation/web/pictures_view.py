@@ -22,7 +22,7 @@ SCRIPT = f"""
   window.cranionavPictures = true;
   const address = new URL('{PICTURES}', window.location.href), words = {words.PICTURE_OLD!r};
   address.protocol = address.protocol.replace('http', 'ws');
-  const decoded = new Map(), latest = new Map(), utf8 = new TextDecoder();
+  const decoded = new Map(), latest = new Map(), shown = new Map(), utf8 = new TextDecoder();
   let socket = null, told = {{}}, heard = performance.now(), frame = 0;
 
   const draw = () => {{
@@ -33,6 +33,7 @@ SCRIPT = f"""
       const width = picture.displayWidth || picture.width, height = picture.displayHeight || picture.height;
       if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, {{ width, height }});
       canvas.getContext('2d', {{ alpha: false }}).drawImage(picture, 0, 0);
+      shown.set(area, canvas);
       picture.close();
       decoded.delete(area);
       if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify([area, number]));
@@ -65,7 +66,17 @@ SCRIPT = f"""
     }};
     socket.onclose = () => setTimeout(connect, 1000);
   }};
+  const keep = () => {{  // another layout makes new canvases: they show the last picture until theirs comes
+    for (const canvas of document.querySelectorAll('canvas[data-picture]')) {{
+      const area = canvas.dataset.picture, before = shown.get(area);
+      if (!before || before === canvas) continue;
+      Object.assign(canvas, {{ width: before.width, height: before.height }});
+      canvas.getContext('2d', {{ alpha: false }}).drawImage(before, 0, 0);
+      shown.set(area, canvas);
+    }}
+  }};
   const say = () => {{
+    keep();
     if (decoded.size && !frame) frame = requestAnimationFrame(draw);
     const quiet = (performance.now() - heard) / 1000;
     for (const sign of document.querySelectorAll('[data-behind]')) {{

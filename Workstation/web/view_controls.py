@@ -87,6 +87,14 @@ class ViewControls:
             node.GetDisplayNode().SetWindowLevel(WINDOWS[name].width_hu, WINDOWS[name].level_hu)
         self._state.window = name
 
+    def look(self) -> None:
+        """Show which window the slices have; none once it has been set by dragging."""
+        node = scene.find("CT")
+        display = node.GetDisplayNode() if node is not None else None
+        if display is not None:
+            now = GreyWindow(round(display.GetWindow()), round(display.GetLevel()))
+            self._state.window = next((name for name, window in WINDOWS.items() if window == now), "")
+
     def drag_sets_window(self, wanted: bool) -> None:
         """Let dragging in a slice set the grey window, or give the mouse back."""
         node = host.scene().GetNodeByID("vtkMRMLInteractionNodeSingleton")

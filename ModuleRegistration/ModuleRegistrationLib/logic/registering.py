@@ -176,7 +176,12 @@ class RegisteringSteps(RegistrationStep):
         if refused:
             raise InputError("; ".join(verdict.messages) or "the registration is refused")
         scene_data.set_points("RegisteredPoints", LabelledPoints(points.labels, result.points_ras_mm))
-        return "; ".join([f"{verdict.status}: {len(points)} bone points laid on the skull", *verdict.messages])
+        laid = f"{verdict.status}: {len(points)} bone points laid on the skull"
+        error = "the error to expect at the targets is not known"
+        if predicted is not None:
+            mean, worst = predicted.mean_mm.mean(), predicted.p95_mm.max()
+            error = f"error to expect at the targets {mean:.1f} mm (mean), {worst:.1f} mm at the worst (95%)"
+        return "; ".join([laid, error, *verdict.messages])
 
     def surfaceResidual(self) -> Optional[Reading]:
         """RMS distance of the bone points to the surface."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Optional
+from typing import TYPE_CHECKING, Any, Optional, Union
 
 from CranioNavLib import scene_data
 from CranioNavLib.files import output_folder
 from CranioNavLib.module_logic import done_or
-from CranioNavLib.panel import Progress, Reading, StepState, StepStatus, Task
+from CranioNavLib.panel import Level, Progress, Reading, StepState, StepStatus, Task
 from CranioNavLib.slicer_files import save_scene, write_transform
 
 from ModuleRegistrationLib import quantities as names
@@ -38,14 +38,16 @@ class VerifyingSteps(RegisteringSteps):
             progress("comparing with what the registration has not used", 0.1)
             return verify(given)
 
-        def take(checks: Checks) -> str:
+        def take(checks: Checks) -> Union[str, Reading]:
             errors, distances = checks.errors, checks.distances
             if errors:
                 scene_data.set_table("TargetErrors", {"target": list(labels), "TRE (mm)": errors.errors_mm.tolist()})
             results.write_rows({**results.rows(), **verification_rows(checks), **self._judgedAgain(checks)})
             said = [f"TRE {errors.mean_mm:.2f} mm (mean), {errors.max_mm:.2f} mm (largest)"] if errors else []
             said += [f"plausibility {distances.max_mm:.2f} mm (largest)"] if distances else []
-            return "; ".join([*said, *checks.confidence.sentences()])
+            doubts = [sentence for sentence in checks.confidence.sentences() if results.contradicts(sentence)]
+            text = "; ".join([*said, *doubts]) or "verified; see below"  # what agrees stands in the read-outs
+            return Reading(text, Level.WARNING) if doubts else text
 
         return Task("Verify", check, take)
 
