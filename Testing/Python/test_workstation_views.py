@@ -219,6 +219,23 @@ def test_planned_and_touched_points_differ_in_shape_not_only_in_colour():
     assert STYLES["ProtocolPoints"].glyph != STYLES["SurfacePoints"].glyph
 
 
+def test_the_skull_is_not_coloured_by_another_registrations_error_while_its_own_is_computed(an_empty_scene):
+    waiting = []
+    copy, views = a_bone(an_empty_scene), error_views.ErrorViews(lambda compute, finished: waiting.append((compute, finished)))
+    scene.find_or_create("ReferenceToRas").SetAttribute(scene.STATUS_ATTRIBUTE, "landmarks")
+    turning = np.diag([1e-4, 1e-4, 1e-4, 0.25, 0.25, 0.25])
+    scene_data.set_motion_error(turning, np.zeros(3), None)
+    for _ in range(2):
+        assert views.refresh(copy.node, error_views.MAP) is None  # computing
+    ((compute, finished),) = waiting
+    finished(compute())
+    assert views.refresh(copy.node, error_views.MAP) is not None
+    scene_data.set_motion_error(4 * turning, np.zeros(3), None)
+    assert views.refresh(copy.node, error_views.MAP) is None
+    assert not copy.node.GetDisplayNode().GetScalarVisibility()
+    assert len(waiting) == 2
+
+
 def test_the_ring_has_the_size_of_the_error_and_goes_without_one(an_empty_scene):
     ring = ErrorRing()
     ring.show(np.array([10.0, -20, 30]), 2.5)

@@ -73,7 +73,7 @@ class WorkstationApp(TrameApp):
         self._moved_s, self._sharpness = 0.0, Sharpness(self._sharpen)
         self._in_turn = itertools.cycle(self.panels)  # of panels that are not shown, one at a time is looked at
         self._use_folder()
-        self.views, self.cues = ViewFollower(self.slicer), Cues()
+        self.views, self.cues = ViewFollower(self.slicer, self.runner.start), Cues()
         self.controls = ViewControls(self.server, self.layouts, self.views.fit)
         self.server.state.legend, self.server.state.cue, self.server.state.muted = None, {}, False
         self.server.state.live = drawings(self.logics[ULTRASOUND])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,10 +21,19 @@ USED_MM, REJECTED_MM = 3.0, 4.5  # half the size of a point as drawn
 
 
 class ErrorViews:
-    """Colours the bone as drawn, and draws the registered points; computes only what has changed."""
+    """Colours the bone as drawn, and draws the registered points; computes only what has changed.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    start : callable
+        Calls its first argument, off the main thread if it can, and then its second one with what came out (a result or an
+        exception) in the main thread.
+    """
+
+    def __init__(self, start: Callable[[Callable[[], Any], Callable[[Any], None]], None] | None = None) -> None:
+        self._start = start or (lambda compute, finished: finished(compute()))
         self._mapped: Any = None
+        self._computing: Any = None
         self._residuals: Any = None
         self._points: Any = None
 
@@ -44,10 +54,7 @@ class ErrorViews:
         return None
 
     def _map(self, bone: Any) -> bool:
-        """Whether the bone carries the error to expect; computed if it is another one."""
-        from ModuleRegistrationLib.registration.error_theory import predict_tre
-        from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
-
+        """Whether the bone carries an error to expect with the registration in force; computed anew if there is another one."""
         known, mesh = scene_data.get_motion_error(), bone.GetPolyData()
         if known is None or mesh is None or not mesh.GetNumberOfPoints():
             return False
@@ -56,20 +63,24 @@ class ErrorViews:
         last = node.GetNthControlPointPosition(taken - 1) if node is not None and taken else ()
         motion = scene.find_or_create("ReferenceToRas").GetAttribute(scene_data.MOTION_ERROR)
         stamp = (mesh, motion, tuple(last), taken)
-        if self._mapped == stamp:
-            return True
-        vertices = vtk_to_numpy(mesh.GetPoints().GetData()).astype(float)
-        normals = vtk_to_numpy(mesh.GetPointData().GetNormals()).astype(float)
-        covariance, pivot, freedom = known
-        if taken:
-            covariance = _with_points_taken(covariance, pivot, vertices, normals)
-        errors = numpy_to_vtk(predict_tre(covariance, pivot, vertices, freedom).p95_mm, deep=True)
-        errors.SetName(ERROR)
-        mesh.GetPointData().AddArray(errors)
+        if stamp not in (self._mapped, self._computing):
+            self._computing = stamp
+            self._start(_errors_on(mesh, known, taken), lambda errors: self._color(bone, stamp, errors))
+        return self._mapped is not None and self._mapped[:2] == stamp[:2]  # with fewer points, perhaps: the legend says how many
+
+    def _color(self, bone: Any, stamp: Any, errors: Any) -> None:
+        if isinstance(errors, Exception):
+            raise errors
+        if self._computing != stamp:
+            return  # there is something newer by now
+        from vtkmodules.util.numpy_support import numpy_to_vtk
+
+        mesh, values = stamp[0], numpy_to_vtk(errors, deep=True)
+        values.SetName(ERROR)
+        mesh.GetPointData().AddArray(values)
         mesh.Modified()
         color_by(bone, ERROR, MOST_MM[MAP])
         self._mapped = stamp
-        return True
 
     def _draw_points(self) -> bool:
         """Whether there are registered points to be drawn by residual; drawn anew if they are others."""
@@ -132,6 +143,26 @@ def residual_glyphs(positions_mm: Array, residuals_mm: Array, used: Array) -> An
     return together.GetOutput()
 
 
+def _errors_on(mesh: Any, known: Any, taken: int) -> Callable[[], Array]:
+    """Computes the 95% error (N,) to expect at the points of a mesh, from what the scene holds now. In any thread."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    vertices = vtk_to_numpy(mesh.GetPoints().GetData()).astype(float)
+    normals = vtk_to_numpy(mesh.GetPointData().GetNormals()).astype(float)
+    covariance, pivot, freedom = known
+    points = scene_data.get_bone_points("SurfacePoints", LEAST_SD_MM) if taken else None
+    matrix = scene_data.get_transform("ReferenceToRas")
+
+    def compute() -> Array:
+        from ModuleRegistrationLib.registration.error_theory import predict_tre
+
+        then = covariance if points is None else _with_points_taken(covariance, pivot, vertices, normals, points, matrix)
+        errors: Array = predict_tre(then, pivot, vertices, freedom).p95_mm
+        return errors
+
+    return compute
+
+
 def _landmarks_alone() -> bool:
     """Whether the registration in force is the landmarks', and no surface registration has judged the points yet."""
     from ModuleRegistrationLib.quantities import QUANTITY, STATUS
@@ -141,12 +172,13 @@ def _landmarks_alone() -> bool:
     return scene.find("Results") is None or STATUS not in scene_data.get_table("Results").get(QUANTITY, [])
 
 
-def _with_points_taken(covariance: Array, pivot: Array, vertices: Array, normals: Array) -> Array:
-    """The covariance to expect with the bone points that are in the scene."""
+def _with_points_taken(
+    covariance: Array, pivot: Array, vertices: Array, normals: Array, points: BonePoints, matrix: Array
+) -> Array:
+    """The covariance to expect with these bone points, which lie in the reference's frame."""
     from ModuleRegistrationLib.registration.prospect import covariance_with_points
     from scipy.spatial import cKDTree
 
-    points, matrix = scene_data.get_bone_points("SurfacePoints", LEAST_SD_MM), scene_data.get_transform("ReferenceToRas")
     positions = transform_points(matrix, points.positions_mm)
     across = normals[cKDTree(vertices).query(positions)[1]]
     in_reference = across @ matrix[:3, :3]  # the same normals, turned back

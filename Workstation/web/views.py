@@ -20,12 +20,12 @@ WITH_ERROR = ("landmarks", "ultrasound", "verification", "navigation", "report")
 class ViewFollower:
     """Looks at the scene now and then; when the CT or the bone is another one, the views turn to it."""
 
-    def __init__(self, slicer_app: Any) -> None:
+    def __init__(self, slicer_app: Any, start: Any) -> None:
         self._app = slicer_app
         self._framing = Framing(slicer_app.view_manager, self._bounds)
         self._bone, self._skin = CoarseCopy("Bone"), CoarseCopy("Skin")
         self._tools, self._ring = ToolModels(), ErrorRing()
-        self._points, self._errors = PointStyles(), ErrorViews()
+        self._points, self._errors = PointStyles(), ErrorViews(start)
         self._image: Any = None
         self._asked_for_in, self._zoomed = ("", ""), False
         for view in slicer_app.view_manager.get_threed_views():
