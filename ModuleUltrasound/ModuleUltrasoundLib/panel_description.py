@@ -34,12 +34,20 @@ TOWARDS_TABLE: dict[PatientLies, Optional[tuple[float, float, float]]] = {  # RA
 }
 
 
+class PalpateBy(str, Enum):
+    """How the probe finds the bone."""
+
+    POINTS = "points: rest on each"
+    SWEEP = "sweep: glide over the skull"
+
+
 @dataclass(frozen=True)
 class UltrasoundParameters(Parameters):
     """What the ultrasound module keeps in the scene."""
 
     device: Annotated[str, "where RF lines come from"] = "simulated"
     patient_lies: Annotated[PatientLies, "points that the table hides are asked for last"] = PatientLies.FREE
+    palpate_by: Annotated[PalpateBy, "one point where the probe rests, or one every 2 mm of its way"] = PalpateBy.POINTS
     recording_path: Annotated[str, "recording to be measured, or to be written (.igs.mha)"] = ""
     speed_of_sound_m_s: Annotated[float, Limits(1300, 1800), "speed of sound in the scalp: mean of the prior"] = (
         EchoSettings.speed_of_sound_m_s
@@ -100,6 +108,7 @@ PANEL = Panel(
             title="Palpation",
             help="Hold the probe still on each point, or sweep it slowly; every line is recorded.",
             items=(
+                ParameterField("palpate_by", "Palpate by"),
                 FileField("recording_path", "Recording", RECORDINGS, save=True),
                 Action("startRecording", "Record", "Begin to record lines and poses", primary=True),
                 Action("stopRecording", "Stop the recording", "Finish the file and measure it"),

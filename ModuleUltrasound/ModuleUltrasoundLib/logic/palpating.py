@@ -13,16 +13,19 @@ from CranioNavLib.panel import Level, Reading, StepState, StepStatus, Task
 from CranioNavLib.rigid import invert_rigid, transform_points
 
 from ModuleUltrasoundLib.line_stream import PosedLine
-from ModuleUltrasoundLib.logic.asking import AskStep
 from ModuleUltrasoundLib.logic.measuring import MeasureStep
 from ModuleUltrasoundLib.logic.planning import count_of, registered
+from ModuleUltrasoundLib.logic.sweeping import SweepStep
+from ModuleUltrasoundLib.panel_description import PalpateBy
 
 if TYPE_CHECKING:
     from ModuleUltrasoundLib.line_recorder import LineRecorder
     from ModuleUltrasoundLib.palpation import Palpation, PalpationStatus
 
+ENOUGH = 200  # points of a sweep after which stopping is suggested
 
-class PalpationStep(AskStep, MeasureStep):
+
+class PalpationStep(SweepStep, MeasureStep):
     """Recording, and SurfacePoints as they are taken."""
 
     def __init__(self, parent: Any = None) -> None:
@@ -53,16 +56,19 @@ class PalpationStep(AskStep, MeasureStep):
     # Recording
 
     def startRecording(self) -> str:
-        """Record every line with its pose into `recording_path`; points of the protocol are taken by resting on them."""
+        """Record every line with its pose into `recording_path`; points are taken where the probe rests, or as it glides."""
         from ModuleUltrasoundLib.line_recorder import LineRecorder
-        from ModuleUltrasoundLib.palpation import Palpation
+        from ModuleUltrasoundLib.palpation import Palpation, Sweep
 
         path = self.parameters().read().recording_path
         earlier = set_aside(path)
         first = self.latest[-1].line
         self.recorder = LineRecorder(path, first, self.running.acquisition)
-        if count_of("ProtocolPoints"):
-            self.palpation, self._fedTime = Palpation(scene_data.get_points("ProtocolPoints").labels), first.host_time_s
+        self._fedTime = first.host_time_s
+        if self.parameters().read().palpate_by is PalpateBy.SWEEP:
+            self.sweep = Sweep()
+        elif count_of("ProtocolPoints"):
+            self.palpation = Palpation(scene_data.get_points("ProtocolPoints").labels)
             self.beginAsking()
         return f"recording into {path}" + (f"; the one before is kept as {earlier.name}" if earlier is not None else "")
 
@@ -94,7 +100,7 @@ class PalpationStep(AskStep, MeasureStep):
         if self.recorder is not None:
             self.record(self.poser.ready(everything=True) if self.poser is not None else [])
             self.recorder.close()
-        self.recorder = self.palpation = self._palpated = None
+        self.recorder = self.palpation = self.sweep = self._palpated = None
 
     def measureRecordingBlocked(self) -> str:
         """Why nothing can be measured now."""
@@ -103,16 +109,19 @@ class PalpationStep(AskStep, MeasureStep):
     # Points
 
     def takePoints(self) -> None:
-        """A point on which the probe has rested long enough is taken, and the next one is asked for."""
+        """A point on which the probe has rested long enough is taken, and the next one is asked for; a sweep goes on."""
         from ModuleUltrasoundLib.palpation import lines_of
 
-        if self.palpation is None or self.measured is None:
+        if self.measured is None or (self.palpation is None and self.sweep is None):
+            return
+        measured = lines_of(self.measured, [item.line.host_time_s for item in self.latest])
+        lines = [line for line in measured if line.time_s > self._fedTime]
+        self._fedTime = max([self._fedTime, *(line.time_s for line in lines)])
+        if self.palpation is None:
+            self.sweepOver(lines)
             return
         new = False
-        for line in lines_of(self.measured, [item.line.host_time_s for item in self.latest]):
-            if line.time_s <= self._fedTime:
-                continue
-            self._fedTime = line.time_s
+        for line in lines:
             self._palpated = self.palpation.add(line)
             if self._palpated.new_point is not None:
                 new = True
@@ -153,7 +162,7 @@ class PalpationStep(AskStep, MeasureStep):
     def dwell(self) -> Optional[Reading]:
         """How many points are taken, and what the present one still lacks."""
         if self._palpated is None:
-            return None
+            return self.swept()
         done = f"{self._palpated.taken} of {self._palpated.total} points; rested {self._palpated.dwell:.0%} of the time needed"
         return Reading("; ".join(filter(None, [done, self._palpated.reason])))
 
@@ -168,10 +177,13 @@ class PalpationStep(AskStep, MeasureStep):
         """How much has been recorded."""
         if self.recorder is None:
             return None
-        return Reading(f"{self.recorder.lines} lines at {len(self.recorder.points)} points")
+        return Reading(f"{self.recorder.lines} lines" + (f" at {len(self.recorder.points)} points" if self.sweep is None else ""))
 
     def palpationStatus(self) -> StepStatus:
         """Whether something is being or has been recorded."""
+        if self.sweep is not None:
+            message = "glide over the skull, then stop the recording"
+            return StepStatus(StepState.ATTENTION, message, "stopRecording" if len(self.sweep) >= ENOUGH else "")
         if self.recorder is not None:
             taken, planned = len(self.taken()), count_of("ProtocolPoints")
             if taken < planned:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from CranioNavLib import scene, scene_data
 from CranioNavLib.errors import InputError
 from CranioNavLib.panel import Level, Reading, StepStatus
+from CranioNavLib.rigid import Array
 
 from ModuleUltrasoundLib.line_stream import LinePoser, LineStream, PosedLine
 from ModuleUltrasoundLib.logic.planning import ProtocolStep, registered
@@ -97,19 +98,27 @@ class ProbeStep(ProtocolStep):
         return True
 
     def steer(self) -> None:
-        """Where the probe stands to the current point, under the registration in force."""
+        """Where the probe stands to the bone it has to see, under the registration in force."""
         from ModuleUltrasoundLib.guidance import guide
 
-        index, pose = self.currentIndex(), scene_data.get_pose("ProbeToReference")
-        table = scene.find("OuterTable")
+        pose, table = scene_data.get_pose("ProbeToReference"), scene.find("OuterTable")
         self._guide = None
-        if index < 0 or pose.matrix is None or not registered() or table is None:
+        if pose.matrix is None or not registered() or table is None:
             return
-        positions, normals, _ = self.protocolPoints()
-        probe_to_ras = scene_data.get_transform("ReferenceToRas") @ pose.matrix
+        probe_to_ras, surface = scene_data.get_transform("ReferenceToRas") @ pose.matrix, self._surfaceOf(table)
+        aim = self.aimAt(probe_to_ras, surface)
+        if aim is None:
+            return
         error = scene_data.get_motion_error()
-        rotation = None if error is None else error[0][:3, :3]
-        self._guide = guide(probe_to_ras, self._surfaceOf(table), positions[index], normals[index], rotation)
+        self._guide = guide(probe_to_ras, surface, *aim, None if error is None else error[0][:3, :3])
+
+    def aimAt(self, probe_to_ras: Array, surface: Surface) -> Optional[tuple[Array, Array]]:
+        """Where the beam has to meet the bone, and its outward normal there (RAS); None without a point that is asked for."""
+        index = self.currentIndex()
+        if index < 0:
+            return None
+        positions, normals, _ = self.protocolPoints()
+        return positions[index], normals[index]
 
     def _surfaceOf(self, table: Any) -> Surface:
         stamp, surface = self._surface

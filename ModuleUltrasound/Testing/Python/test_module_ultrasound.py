@@ -293,6 +293,28 @@ def test_a_point_where_the_reference_base_stands_is_asked_for_last(a_recording_l
     assert logic.currentIndex() != first
 
 
+def test_a_gliding_probe_leaves_points_on_its_way_and_asks_for_none(a_recording_logic, tmp_path):
+    logic = a_recording_logic
+    logic.closeRecording()
+    logic.parameters().change(palpate_by=module_panel.PalpateBy.SWEEP, recording_path=str(tmp_path / "sweep.igs.mha"))
+    logic.startRecording()
+    assert logic.currentPoint() is None
+    start = on_point(logic, 0)
+    for step in range(60):  # 12 mm along the probe's own x, slower than a sweep may be
+        pose = start.copy()
+        pose[:3, 3] += 0.2 * step * start[:3, 0]
+        run_for(logic, 0.03, pose)
+    assert logic.guidance() is not None  # where it is, it only has to stand upright
+    assert logic.palpationStatus().state is StepState.ATTENTION
+    assert "points of the sweep" in logic.dwell().text
+    logic.showSweep()
+    along = scene_data.get_bone_points().positions_mm @ start[:3, 0]
+    assert 4 <= len(along) <= 8  # one every 2 mm
+    assert np.ptp(along) > 8
+    logic.closeRecording()
+    assert set(read_recording(tmp_path / "sweep.igs.mha").palpation_points.tolist()) == {-1}
+
+
 def test_a_probe_far_from_the_point_takes_nothing_and_is_told_so(a_recording_logic):
     logic = a_recording_logic
     run_for(logic, 1.5, on_point(logic, 9))
