@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from CranioNavLib import host, scene, scene_data
+from CranioNavLib.bone_points import BonePoints
 from CranioNavLib.rigid import Array, transform_points
 
 from Workstation.web import words
