@@ -133,6 +133,8 @@ PANEL = Panel(
                 Action("measureRecording", "Measure recording", "Read the recording and write SurfacePoints", primary=True),
                 NodeField("SurfacePoints", "Bone points"),
                 ReadOut("pointCount", "Points"),
+                ReadOut("pressedSpeed", "Speed of sound by pressing"),
+                Action("useSpeed", "Use this speed of sound", "As the prior of the next measurement"),
             ),
             status="measureStatus",
         ),

@@ -39,6 +39,9 @@ class SpeedEstimate:
     spots: int
     frames: int
 
+    def __str__(self) -> str:
+        return f"{self.pressed_m_s:.0f} ± {self.pressed_sd_m_s:.0f} m/s ({self.spots} spot{'s' if self.spots > 1 else ''})"
+
 
 @dataclass(frozen=True, eq=False)
 class _Spot:
@@ -96,6 +99,14 @@ def estimate_speed(recording: Recording, lines: LineMeasurements) -> SpeedEstima
         spots=len(spots),
         frames=int(sum(mask.sum() for mask in keep)),
     )
+
+
+def estimate_if_pressed(recording: Recording, lines: LineMeasurements) -> Optional[SpeedEstimate]:
+    """The estimate, or None where no spot was pressed hard and softly enough to tell."""
+    try:
+        return estimate_speed(recording, lines)
+    except InputError:
+        return None
 
 
 def _spots(recording: Recording, lines: LineMeasurements) -> list[_Spot]:

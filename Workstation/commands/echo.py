@@ -18,11 +18,13 @@ def echo(
 ) -> None:
     """Find the bone echo in every line and write its depth, position and quality; refused lines say why."""
     from collections import Counter
+    from dataclasses import asdict
 
     from CranioNavLib.sequence_metafile import read_recording
     from ModuleUltrasoundLib.echo_search import check_length
     from ModuleUltrasoundLib.measure import EchoSettings, measure_lines
     from ModuleUltrasoundLib.measure_table import write_depths_csv
+    from ModuleUltrasoundLib.speed_of_sound import estimate_if_pressed
 
     from Workstation.terminal import print_json, progress_bar
 
@@ -35,12 +37,14 @@ def echo(
         measured = measure_lines(lines, settings)
         say("writing", 0.95)
         write_depths_csv(output, lines, measured)
+        pressed = estimate_if_pressed(lines, measured)
     reasons = Counter(reason for reason, accepted in zip(measured.reasons, measured.accepted) if not accepted)
     if json:
-        print_json(
-            {"depths": str(output), "lines": len(lines), "accepted": int(measured.accepted.sum()), "refused": dict(reasons)}
-        )
+        summary = {"depths": str(output), "lines": len(lines), "accepted": int(measured.accepted.sum()), "refused": dict(reasons)}
+        print_json({**summary, "speed_by_pressing": None if pressed is None else asdict(pressed)})
         return
     print(f"{output}: {int(measured.accepted.sum())} of {len(lines)} lines show bone")
     for reason, count in reasons.most_common():
         print(f"  {count} refused: {reason}")
+    if pressed is not None:
+        print(f"speed of sound by pressing: {pressed}")

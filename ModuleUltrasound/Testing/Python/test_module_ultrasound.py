@@ -12,7 +12,7 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.panel import Level, StepState
 from CranioNavLib.parameters import Parameters
 from CranioNavLib.rigid import rigid, rigid_from_vector
-from CranioNavLib.sequence_metafile import Acquisition, read_recording
+from CranioNavLib.sequence_metafile import Acquisition, Recording, read_recording, write_recording
 from CranioNavLib.slicer_files import LabelledPoints, load_scene, save_scene
 from CranioNavLib.surface import Surface
 from ModuleUltrasoundLib import panel_description as module_panel
@@ -340,3 +340,32 @@ def test_without_a_registration_there_is_no_guidance(a_recording_logic):
     run_for(a_recording_logic, 0.6, on_point(a_recording_logic, 0))
     assert a_recording_logic.guidance() is None
     assert a_recording_logic.tilt() is None
+
+
+def pressing_recording(path, speed_m_s=1480.0):
+    """Flat bone under a probe that presses hard and softly: its face moves as far as the tissue gives way."""
+    rng, frames = np.random.default_rng(5), 60
+    depth = 6.5 - 1.5 * (1 - np.cos(np.linspace(0, 8, frames))) / 2
+    poses = np.tile(POSE, (frames, 1, 1))
+    poses[:, 2, 3] = depth  # the beam points down
+    lines = np.stack([echo_line(mm * SPEED_M_S / speed_m_s, rng) for mm in depth])
+    times = np.arange(frames) / 40
+    write_recording(
+        path, Recording(lines, Acquisition(RATE_HZ, CARRIER_HZ), poses, ("OK",) * frames, times, np.zeros(frames, int))
+    )
+
+
+def test_the_speed_of_sound_told_by_pressing_is_reported_and_taken_over_once(a_logic, tmp_path):
+    path = tmp_path / "pressed.igs.mha"
+    pressing_recording(path)
+    a_logic.parameters().change(recording_path=str(path))
+    assert a_logic.useSpeedBlocked() != ""
+    a_logic.measureRecording().run()
+    assert a_logic.pressed.pressed_m_s == pytest.approx(1480, abs=3 * a_logic.pressed.pressed_sd_m_s)
+    assert a_logic.pressed.pressed_sd_m_s < 40
+    told = a_logic.pressed.speed_m_s
+    assert a_logic.useSpeedBlocked() == ""
+    a_logic.useSpeed()
+    assert a_logic.parameters().read().speed_of_sound_m_s == pytest.approx(told, abs=0.1)
+    assert a_logic.pressedSpeed() is None
+    assert a_logic.useSpeedBlocked() != ""

@@ -4,7 +4,7 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition, Recording
 from ModuleUltrasoundLib.measure import LineMeasurements
-from ModuleUltrasoundLib.speed_of_sound import estimate_speed
+from ModuleUltrasoundLib.speed_of_sound import estimate_if_pressed, estimate_speed
 
 
 def pressed(rng, true_speed, spots=8, frames=40, noise_mm=0.0, press_mm=2.0, slope=0.0, drift_mm=0.0):
@@ -81,3 +81,11 @@ def test_prior_holds_what_the_pressing_leaves_open():
 def test_steady_pressure_is_refused():
     with pytest.raises(InputError, match="vary the pressure"):
         estimate_speed(*pressed(np.random.default_rng(5), 1540.0, press_mm=0.1))
+
+
+def test_a_probe_that_never_pressed_tells_no_speed_and_one_that_did_says_it_in_words():
+    rng = np.random.default_rng(3)
+    assert estimate_if_pressed(*pressed(rng, 1500.0, press_mm=0.1)) is None
+    estimate = estimate_if_pressed(*pressed(rng, 1500.0, spots=1))
+    assert str(estimate).startswith("1500 ± ")
+    assert str(estimate).endswith("(1 spot)")
