@@ -27,6 +27,7 @@ from ModuleRegistrationLib.registration.pairing import pair_points
 from ModuleRegistrationLib.registration.problem import METHODS, RegistrationProblem, RegistrationResult
 from ModuleRegistrationLib.registration.verdict import Limits, Verdict, judge
 from ModuleRegistrationLib.verification.confidence import LIMIT_MM, Confidence, assess, doubted, touched_points
+from ModuleRegistrationLib.verification.held_out import DistanceCheck
 from ModuleRegistrationLib.verification.plausibility import Plausibility, plausibility
 from ModuleRegistrationLib.verification.tre import TargetErrors, target_errors
 
@@ -123,11 +124,8 @@ def register_case(
     say("verifying", 0.85)
     targets, target_labels = _targets(case, bone)
     predicted = predict_tre_of(registration, targets) if registration.covariance is not None else None
-    confidence = assess(problem, registration, targets, plugin, limit_mm)
-    checks = _plausibility(case, registration, bone)
-    if checks is not None and case.plausibility is not None:
-        touched = touched_points(problem, registration, checks, case.plausibility.labels, STYLUS_POINT_SD_MM)
-        confidence = replace(confidence, touched=touched)
+    checks, touched = _plausibility(case, problem, registration, bone)
+    confidence = replace(assess(problem, registration, targets, plugin, limit_mm), touched=touched)
     verdict = judge(problem, registration, targets, LANDMARKS_ALONE if mode in LANDMARK_MODES else None)
     return CaseResult(
         case=case,
@@ -244,7 +242,11 @@ def _measured_tre(case: Case, registration: RegistrationResult) -> Optional[Targ
     return target_errors(registration.reference_to_ras, planned, touched)
 
 
-def _plausibility(case: Case, registration: RegistrationResult, bone: BoneSurfaces) -> Optional[Plausibility]:
+def _plausibility(
+    case: Case, problem: RegistrationProblem, registration: RegistrationResult, bone: BoneSurfaces
+) -> tuple[Optional[Plausibility], Optional[DistanceCheck]]:
+    """Distances of the plausibility points, and what was to be expected of them; None without such points."""
     if case.plausibility is None or not len(case.plausibility.labels):
-        return None
-    return plausibility(registration.reference_to_ras, case.plausibility.positions_mm, bone.closed)
+        return None, None
+    found = plausibility(registration.reference_to_ras, case.plausibility.positions_mm, bone.closed)
+    return found, touched_points(problem, registration, found, case.plausibility.labels, STYLUS_POINT_SD_MM)

@@ -113,6 +113,12 @@ def test_a_batch_goes_on_past_a_case_that_fails(a_case, tmp_path, capsys):
     assert not (out / "case" / "report.pdf").exists()
 
 
+def test_a_batch_takes_the_series_that_is_asked_for(a_case, tmp_path):
+    assert run(["batch", str(a_case), "-o", str(tmp_path / "out"), "--series", "7"]) == 2
+    with (tmp_path / "out" / "summary.csv").open() as file:
+        assert "leave out series='7'" in next(csv.DictReader(file))["message"]
+
+
 def test_renamed_landmarks_pair_by_order_and_shuffled_ones_by_label(a_case):
     before = computed(a_case, "IIa")
     patient = read_points(a_case / "landmarks-patient.mrk.json")

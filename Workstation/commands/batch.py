@@ -13,6 +13,7 @@ def batch(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="where the results go")],
     method: Annotated[Optional[str], typer.Option(help="registration plugin")] = None,
     mode: Annotated[Optional[str], typer.Option(help="Ia, Ib, IIa, IIb or III; default: the richest each case allows")] = None,
+    series: Annotated[Optional[str], typer.Option(help="which series, where a CT is a DICOM folder with several")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="cases at the same time")] = 1,
     scenes: Annotated[bool, typer.Option("--scenes", help="write scene.mrb for each case too")] = False,
     pdf: Annotated[bool, typer.Option("--pdf", help="write report.pdf for each case too")] = False,
@@ -39,7 +40,7 @@ def batch(
     folder = output_folder(output)
     records: list[dict[str, Any]] = []
     with progress_bar() as say:
-        work = (delayed(register_one)(case, folder / name, method, mode, scenes, pdf) for case, name in zip(cases, names))
+        work = (delayed(register_one)(case, folder / name, method, mode, scenes, pdf, series) for case, name in zip(cases, names))
         for record in Parallel(n_jobs=jobs, return_as="generator")(work):
             records.append(record)
             say(f"{record['case']}: {record['status']}", len(records) / len(cases))
@@ -51,7 +52,13 @@ def batch(
 
 
 def register_one(
-    case: Path, folder: Path, method: Optional[str], mode: Optional[str], scenes: bool = False, pdf: bool = False
+    case: Path,
+    folder: Path,
+    method: Optional[str],
+    mode: Optional[str],
+    scenes: bool = False,
+    pdf: bool = False,
+    series: Optional[str] = None,
 ) -> dict[str, Any]:
     """The record of one case; one that cannot be registered gives a record that says why."""
     from CranioNavLib.case import read_case
@@ -63,7 +70,7 @@ def register_one(
 
     try:
         output_folder(folder)
-        return write_outputs(register_case(read_case(case), mode, method), folder, scene=scenes, pdf=pdf)
+        return write_outputs(register_case(read_case(case), mode, method, series=series), folder, scene=scenes, pdf=pdf)
     except InputError as error:
         return write_failure(case, folder, "refused", str(error))
     except Exception as error:  # a defect in one case must not cost the others

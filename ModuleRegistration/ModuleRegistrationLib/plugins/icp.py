@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
-
-from CranioNavLib.parameters import Limits, Parameters
-
-from ModuleRegistrationLib.registration.closest_fit import check_problem, finished_result, iterate_closest
+from ModuleRegistrationLib.registration.closest_fit import Stopping, check_problem, finished_result, iterate_closest
 from ModuleRegistrationLib.registration.problem import RegistrationProblem, RegistrationResult, SurfaceRegistration
 
 
@@ -17,12 +12,7 @@ class IterativeClosestPoint(SurfaceRegistration):
     name = "icp"
     title = "Iterative closest points (Besl and McKay 1992), exact on triangles, from the landmark registration"
 
-    @dataclass(frozen=True)
-    class Settings(Parameters):
-        """When to stop."""
-
-        max_iterations: Annotated[int, Limits(1, 10000), "steps at most"] = 100
-        tolerance_mm: Annotated[float, Limits(0, 1), "stop when the RMS distance falls by less"] = 1e-6
+    Settings = Stopping
 
     def register(self, problem: RegistrationProblem) -> RegistrationResult:
         """See the base class; the covariance takes the residuals as the points' error."""

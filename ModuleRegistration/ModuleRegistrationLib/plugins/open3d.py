@@ -16,6 +16,7 @@ from ModuleRegistrationLib.registration.closest_fit import check_problem, finish
 from ModuleRegistrationLib.registration.problem import RegistrationProblem, RegistrationResult, SurfaceRegistration
 
 LEAST_FOR_FEATURES = 500  # a feature histogram needs neighbours; 18 palpated points have none
+LEAST_FITNESS = 0.5  # share of the sweep on the skull: three pairs make a pose, whatever they are
 NORMAL_RADIUS, FEATURE_RADIUS = 3.0, 6.0  # in voxels
 
 
@@ -50,7 +51,7 @@ class Open3dRegistration(SurfaceRegistration):
         Raises
         ------
         InputError
-            `features` with fewer than 500 points.
+            `features` with fewer than 500 points, or where it finds nothing.
         """
         check_problem(problem)
         open3d: Any = importlib.import_module("open3d")
@@ -109,6 +110,11 @@ class Open3dRegistration(SurfaceRegistration):
             ],
             pipeline.RANSACConvergenceCriteria(100000, 0.999),
         )
+        if found.fitness < LEAST_FITNESS:  # Open3D then gives back the identity, or a pose by chance
+            raise InputError(
+                f"variant features found no pose in which the sweep's shape is that of the skull (voxels of {voxel:g} mm); "
+                "choose point-to-plane or method cranionav"
+            )
         return np.asarray(found.transformation, dtype=float)
 
 

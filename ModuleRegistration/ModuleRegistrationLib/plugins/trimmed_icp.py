@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from CranioNavLib.parameters import Limits, Parameters
+from CranioNavLib.parameters import Limits
 
 from ModuleRegistrationLib.registration.closest_fit import (
     LEAST_POINTS,
+    Stopping,
     check_problem,
     finished_result,
     iterate_closest,
@@ -25,12 +26,10 @@ class TrimmedIterativeClosestPoint(SurfaceRegistration):
     title = "Closest points over the best share of the points (Chetverikov 2002)"
 
     @dataclass(frozen=True)
-    class Settings(Parameters):
+    class Settings(Stopping):
         """How many points to trust."""
 
         keep_share: Annotated[float, Limits(0.3, 1), "share of the points used, the closest ones"] = 0.8
-        max_iterations: Annotated[int, Limits(1, 10000), "steps at most"] = 100
-        tolerance_mm: Annotated[float, Limits(0, 1), "stop when the RMS distance falls by less"] = 1e-6
 
     def register(self, problem: RegistrationProblem) -> RegistrationResult:
         """See the base class."""

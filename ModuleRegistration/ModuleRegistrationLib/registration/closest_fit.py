@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Optional
+from typing import Annotated, Optional
 
 import numpy as np
 import numpy.typing as npt
 from CranioNavLib.errors import InputError
+from CranioNavLib.parameters import Limits, Parameters
 from CranioNavLib.rigid import Array, transform_points
 from CranioNavLib.surface import Surface
 
@@ -36,6 +37,14 @@ def check_problem(problem: RegistrationProblem) -> None:
             f"the bone points start {distance:.0f} mm from the skull; "
             "check the landmarks, their pairing and the frame of the points"
         )
+
+
+@dataclass(frozen=True)
+class Stopping(Parameters):
+    """When closest-point iterations stop."""
+
+    max_iterations: Annotated[int, Limits(1, 10000), "steps at most"] = 100
+    tolerance_mm: Annotated[float, Limits(0, 1), "stop when the RMS distance falls by less"] = 1e-6
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from CranioNavLib.errors import InputError
+from CranioNavLib.rigid import invert_rigid
 from ModuleRegistrationLib.registration.problem import METHODS
 
 SURFACE_METHODS = ["icp", "random-icp", "trimmed-icp", "open3d", "cranionav"]
@@ -62,6 +63,16 @@ def test_procrustes_without_landmarks_is_refused(a_case) -> None:
     problem = replace(a_case(0).problem, landmarks_ct_mm=np.empty((0, 3)), landmarks_patient_mm=np.empty((0, 3)))
     with pytest.raises(InputError, match="needs landmark pairs"):
         METHODS.create("procrustes").register(problem)
+
+
+def test_features_of_a_sweep_that_has_nothing_of_a_skull_are_refused(a_case) -> None:
+    problem = a_case(0, repeats=40).problem
+    points = problem.points
+    start = invert_rigid(problem.initial_reference_to_ras)[:3, 3]
+    line = start + np.linspace(-300, 300, len(points))[:, None] * [1.0, 0, 0]
+    method = METHODS.create("open3d", variant="features")
+    with pytest.raises(InputError, match="variant features found no pose"):
+        method.register(replace(problem, points=replace(points, positions_mm=line)))
 
 
 def test_features_need_a_dense_sweep(a_case) -> None:
