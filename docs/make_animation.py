@@ -8,6 +8,7 @@ Everything in the pictures is the application itself, in a headless Chromium; wa
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.util
 import io
 import sys
@@ -18,10 +19,11 @@ from pathlib import Path
 from typing import Any
 
 from PIL import Image
+from playwright.sync_api import Error
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZE = (1024, 640)
-LONG_S, SHORT_S = 1.6, 0.45  # how long a still picture is shown, and one of a movement
+LONG_S, SHORT_S = 1.5, 0.4  # how long a still picture is shown, and one of a movement
 LONGEST_S = 240.0  # of a movement, on a busy machine
 QUALITY = 55
 
@@ -35,26 +37,32 @@ class Film:
         self.seconds: list[float] = []
         self._last = b""
 
-    def take(self, seconds: float = LONG_S, patience_s: float = 20.0) -> None:
-        """One picture, once the views are up to date; where they do not become so in time, as they are."""
+    def take(self, seconds: float = LONG_S, patience_s: float = 20.0) -> bool:
+        """One picture, once the views are up to date; where they do not become so in time, as they are, and False."""
         until = time.monotonic() + patience_s
-        while self._page.locator("[data-behind]:visible").count() and time.monotonic() < until:
-            self._page.wait_for_timeout(50)
+        while self._is_behind() and time.monotonic() < until:
+            self._page.wait_for_timeout(20)
         shot = self._page.screenshot(type="png")
         if shot == self._last:
             self.seconds[-1] += seconds
-            return
+            return True
         self._last = shot
         self.pictures.append(Image.open(io.BytesIO(shot)).convert("RGB").resize(SIZE, Image.Resampling.LANCZOS))
         self.seconds.append(seconds)
+        return not self._is_behind()
+
+    def _is_behind(self) -> bool:
+        return bool(self._page.locator("[data-behind]:visible").count())
 
     def take_until(self, over: Callable[[], bool], every_s: float, most: int, seconds: float = SHORT_S) -> None:
-        """Pictures of a movement until it is over; `most` of them are kept, evenly spread."""
-        first, begun = len(self.pictures), time.monotonic()
+        """Pictures of a movement until it is over; `most` of them are kept, evenly spread, if possible of the up-to-date ones."""
+        first, begun, fresh = len(self.pictures), time.monotonic(), []
         while not over() and time.monotonic() < begun + LONGEST_S:
-            self.take(seconds, patience_s=1.0)
+            if self.take(seconds, patience_s=2.0):
+                fresh.append(len(self.pictures) - 1)
             self._page.wait_for_timeout(1000 * every_s)
-        kept = sorted({round(first + i * (len(self.pictures) - 1 - first) / (most - 1)) for i in range(most)})
+        good = sorted(set(fresh)) if len(set(fresh)) >= most // 3 else list(range(first, len(self.pictures)))
+        kept = sorted({good[round(i * (len(good) - 1) / (most - 1))] for i in range(most)})
         self.pictures[first:] = [self.pictures[i] for i in kept]
         self.seconds[first:] = [seconds for _ in kept]
 
@@ -108,15 +116,12 @@ def prepare(user: Any, film: Film) -> None:
 def register(user: Any, film: Film) -> None:
     """Landmarks, then ultrasound."""
     user.next("calibration")
-    for number in range(4):
-        if number < 2:
-            film.take(1.0)
-        follow(user, "landmarks", "touchNextLandmark")
-        while not is_offered(user, "landmarks", "touchNextLandmark") and not is_offered(user, "landmarks", "registerLandmarks"):
-            if is_offered(user, "landmarks", "digitise"):
-                user.page.wait_for_timeout(1000)
-                follow(user, "landmarks", "digitise")
-            user.page.wait_for_timeout(1500)
+    film.take(1.0)
+    while not is_offered(user, "landmarks", "registerLandmarks"):
+        with contextlib.suppress(Error):  # the button may change under the mouse
+            user.page.locator("[data-panel=landmarks] [data-offer]").first.click(timeout=2000)
+        user.page.wait_for_timeout(1800)
+        film.take(SHORT_S)
     film.take(1.0)
     follow(user, "landmarks", "registerLandmarks")
     user.sees("landmarks", "Done")
