@@ -89,7 +89,6 @@ class User:
         for number in range(4):
             asked = self.reading("landmarks", "nextPoint")
             self.press("landmarks", "touchNextLandmark")
-            self.sees("landmarks", "the stylus goes to")
             for _ in range(10):  # a hand on its way is refused, in words; then one tries again
                 self.page.wait_for_timeout(2500)
                 self.press("landmarks", "digitise")
