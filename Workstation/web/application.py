@@ -36,10 +36,10 @@ from Workstation.web.view_controls import ViewControls, layout_grid
 from Workstation.web.view_frame import SliceSliders
 from Workstation.web.views import ViewFollower
 
-POLL_S = 0.02  # a pose waits for half of it on average
-REFRESH_EVERY = 8  # polls between two looks at the read-outs
+POLL_S = 0.03  # views that follow a tool look for a newer pose just before they are painted
+REFRESH_EVERY = 6  # polls between two looks at the read-outs
 STANDS_S = 0.6  # without a new pose: nothing moves
-SAVE_EVERY = 50  # polls between two looks at what is to be saved
+SAVE_EVERY = 33  # polls between two looks at what is to be saved
 PICTURE_QUALITY = 90  # JPEG; one quality for moving and still pictures, so that none is sent twice
 LOG = logging.getLogger(__name__)
 

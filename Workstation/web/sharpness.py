@@ -8,7 +8,7 @@ from typing import Any
 STEPS = (1.0, 0.85, 0.7, 0.6, 0.5)  # share of the view's pixels, each way
 SLOW_S, QUICK_S = 0.007, 0.0015  # how late rounds begin on average: fewer pixels are needed, more may be possible
 SETTLING_S = 1.5  # after a change, before the next one is thought of
-ENOUGH = 90_000  # pixels of a view; with fewer there is little to be gained
+ENOUGH = 45_000  # pixels of a view; with fewer there is little to be gained
 FIRST_TRIAL_S, LAST_TRIAL_S = 10.0, 160.0  # until more pixels are tried again; twice as long each time that it was in vain
 
 
