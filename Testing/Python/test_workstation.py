@@ -145,8 +145,9 @@ def test_other_pages_and_other_hosts_are_kept_out(tmp_path):
     with served(tmp_path / "session", True) as (url, _):
         assert urllib.request.urlopen(url).status == 200
         for headers in ({"Origin": "http://evil.example"}, {"Host": "evil.example"}):
-            with pytest.raises(urllib.error.HTTPError, match="403"):
-                urllib.request.urlopen(urllib.request.Request(url, headers=headers))
+            for address in (url, f"{url}pictures"):
+                with pytest.raises(urllib.error.HTTPError, match="403"):
+                    urllib.request.urlopen(urllib.request.Request(address, headers=headers))
         with pytest.raises(urllib.error.HTTPError, match="404"):
             urllib.request.urlopen(f"{url}session/report.html")
         with pytest.raises(urllib.error.HTTPError, match="40[34]"):

@@ -62,7 +62,7 @@ class Viewer:
 
     def drew(self, area: str, number: int) -> None:
         """The window has a picture on its screen."""
-        sent = self._sent[area]
+        sent = self._sent.get(area)
         while sent and sent[0].number <= number:
             self._shown[area] = sent.popleft()
         self._news.set()
