@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.rigid import Array, invert_rigid, rigid_from_vector
 from scipy.spatial.transform import Rotation
-from scipy.special import logsumexp
+from scipy.special import betaln, logsumexp
 
 from ModuleRegistrationLib.registration.landmarks import motion_jacobian
-from ModuleRegistrationLib.registration.likelihood import PARAMETERS, Model, State, evaluate
+from ModuleRegistrationLib.registration.likelihood import OUTLIER_PRIOR, PARAMETERS, Model, State, evaluate
 
 PROPOSAL_FREEDOM = 5.0  # tails of the proposal: heavier than the posterior's
 PROPOSAL_STRETCH = 1.3  # its width beside the curvature's
@@ -75,7 +75,7 @@ def sample_posterior(
         minima.offset[origin] + draws[:, 6],
         minima.speed[origin] + (draws[:, 7] if size == PARAMETERS else 0.0),
         minima.scale[origin] * np.exp(np.repeat(rng.normal(0, LOG_SCALE_SD, pairs), 2)),
-        np.full(count, minima.outliers[0]),
+        np.clip(rng.beta(*(exponents[origin] for exponents in _outlier_law(model, minima))), 1e-6, 1 - 1e-6),
     )
     proposal = np.stack([_log_density(model, minima, roots, k, state) + np.log(share[k]) for k in range(len(share))])
     cost = evaluate(model, state).cost
@@ -86,6 +86,12 @@ def sample_posterior(
     return _moments(model, minima, state, weight, np.argmax(proposal, axis=0), np.argsort(cost))
 
 
+def _outlier_law(model: Model, minima: State) -> tuple[Array, Array]:
+    """Exponents (K,) of the Beta law of the share of outliers: how many there seem to be at each minimum, and the prior."""
+    weight = len(model.points) + OUTLIER_PRIOR[1]
+    return 1 + weight * minima.outliers, 1 + weight * (1 - minima.outliers)
+
+
 def _log_density(model: Model, minima: State, roots: Array, k: int, state: State) -> Array:
     """Log density of the proposal around minimum k at the samples (S,), up to a common constant."""
     vector = motion_vector(state.motion @ invert_rigid(minima.motion[k]), model.pivot)
@@ -94,11 +100,16 @@ def _log_density(model: Model, minima: State, roots: Array, k: int, state: State
     white = np.linalg.solve(roots[k], apart[:, :size].T)
     narrow = np.log(np.diagonal(roots[k])).sum()
     scale = np.log(state.scale / minima.scale[k]) / LOG_SCALE_SD
-    density: Array = -(PROPOSAL_FREEDOM + size) / 2 * np.log1p((white**2).sum(axis=0) / PROPOSAL_FREEDOM) - narrow - scale**2 / 2
+    bad, good = (exponents[k] for exponents in _outlier_law(model, minima))
+    share = (bad - 1) * np.log(state.outliers) + (good - 1) * np.log1p(-state.outliers) - betaln(bad, good)
+    distance = (PROPOSAL_FREEDOM + size) / 2 * np.log1p((white**2).sum(axis=0) / PROPOSAL_FREEDOM)
+    density: Array = share - distance - narrow - scale**2 / 2
     return density
 
 
-def _moments(model: Model, minima: State, state: State, weight: Array, nearest: Array, likeliest: npt.NDArray[np.int64]) -> Posterior:
+def _moments(
+    model: Model, minima: State, state: State, weight: Array, nearest: Array, likeliest: npt.NDArray[np.int64]
+) -> Posterior:
     probabilities = np.bincount(nearest, weight, len(minima.motion))
     origin = minima.motion[int(np.argmax(probabilities))]
     vectors = motion_vector(state.motion @ invert_rigid(origin), model.pivot)
