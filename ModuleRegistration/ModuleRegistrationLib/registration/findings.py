@@ -30,6 +30,8 @@ LEAST_PER_SIDE, MOST_SPLITS = 5, 40
 LANDMARK_FAR_MM = 15.0
 ONE_SIDED = 0.2  # of the skull's half size: how far points must reach beyond its middle to see the other side
 SPHERE_MM = 0.8  # a sphere through the points that misses them by less is as good as the skull itself
+LEAST_CHECKED = 10  # points used: six degrees of freedom and the common offset take seven, the others show whether they agree
+MOST_OFFSET_SDS = 4.0  # of the common offset's prior
 AXES = ("left-right", "front-back", "head-foot")
 
 
@@ -82,6 +84,10 @@ def find_one_sidedness(problem: RegistrationProblem, result: RegistrationResult)
     if side:
         text = f"all points lie on the {side} side: rotation about the front-back axis is poorly held; add points opposite"
         findings.append(Finding(WARNING, text))
+    end = "front" if place[:, 1].min() > ONE_SIDED else "back" if place[:, 1].max() < -ONE_SIDED else ""
+    if end and not side:
+        text = f"all points lie on the {end} of the head: the other end is poorly held; add points above and behind the ears"
+        findings.append(Finding(WARNING, text))
     if place[:, 2].min() > ONE_SIDED:
         text = (
             "all points lie on the vault: rotation about the head-foot axis is poorly held; add forehead and periorbital points"
@@ -91,6 +97,28 @@ def find_one_sidedness(problem: RegistrationProblem, result: RegistrationResult)
         text = "all points lie on one sphere: every rotation about its centre is poorly held; add periorbital points"
         findings.append(Finding(WARNING, text))
     return findings
+
+
+def find_large_offset(problem: RegistrationProblem, result: RegistrationResult) -> list[Finding]:
+    """Whether all points together lie farther from the bone than its segmentation explains."""
+    offset = result.surface_offset_mm
+    if abs(offset) <= MOST_OFFSET_SDS * problem.surface_offset_sd_mm:
+        return []
+    side = "outside" if offset > 0 else "inside"
+    text = (
+        f"all points together lie {abs(offset):.1f} mm {side} the segmented bone, which it leaves open to "
+        f"{problem.surface_offset_sd_mm:.1f} mm (SD); check the tip's radius, the calibration and the threshold"
+    )
+    return [Finding(WARNING, text)]
+
+
+def find_few_points(result: RegistrationResult) -> list[Finding]:
+    """Whether so few points were used that a wrong pose would fit them as well as the right one."""
+    count = int(result.used.sum())
+    if count >= LEAST_CHECKED:
+        return []
+    text = f"only {count} points are used, too few to show an error among them; palpate {LEAST_CHECKED - count} more"
+    return [Finding(WARNING, text)]
 
 
 def _misses_sphere(points: Array) -> float:

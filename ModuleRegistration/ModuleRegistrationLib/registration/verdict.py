@@ -18,8 +18,10 @@ from ModuleRegistrationLib.registration.findings import (
     Finding,
     find_ambiguity,
     find_bad_fit,
+    find_few_points,
     find_inconsistent_points,
     find_landmark_conflict,
+    find_large_offset,
     find_moved_reference,
     find_one_sidedness,
     find_scale_error,
@@ -84,6 +86,8 @@ def judge(
     if with_points:
         findings += find_bad_fit(result)
         findings += find_one_sidedness(problem, result)
+        findings += find_few_points(result)
+        findings += find_large_offset(problem, result)
         findings += find_inconsistent_points(problem, result)
         findings += find_scale_error(problem, result)
         findings += find_moved_reference(problem, result)

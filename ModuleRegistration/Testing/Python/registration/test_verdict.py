@@ -56,6 +56,21 @@ def test_points_of_the_vault_only_are_flagged(a_case) -> None:
     assert "vault" in " ".join(verdict.messages)
 
 
+def test_points_of_the_forehead_only_are_flagged(a_case) -> None:
+    case = a_case(3, regions=((18, (-40, 40), (-10, 40)),))
+    verdict = judged(case.problem, case.targets)
+    assert verdict.status != "accepted"
+    assert "on the front of the head" in " ".join(verdict.messages)
+
+
+def test_points_that_leave_nothing_to_check_them_by_are_never_accepted(a_case) -> None:
+    case = a_case(3, noise_sd=0.1)
+    few = replace(case.problem, points=case.problem.points.subset(np.arange(0, 18, 2)))
+    verdict = judged(few, case.targets)
+    assert verdict.status != "accepted"
+    assert "only 9 points are used" in " ".join(verdict.messages)
+
+
 def test_swapped_landmarks_are_refused_by_name(a_case) -> None:
     case = a_case(4, landmark_sd=1.0)
     swapped = case.problem.landmarks_patient_mm[[0, 2, 1, 3]]
@@ -83,6 +98,7 @@ def test_a_cloud_of_another_size_is_noticed(a_case) -> None:
     larger = replace(points, positions_mm=middle + 1.04 * (points.positions_mm - middle))
     verdict = judged(replace(case.problem, points=larger), case.targets)
     assert verdict.status != "accepted"
+    assert "mm outside the segmented bone" in " ".join(verdict.messages)
 
 
 def test_a_reference_base_knocked_on_the_way_is_noticed(a_case) -> None:
