@@ -19,6 +19,7 @@ FAR_MM = 12.0  # stands for "there is none" in distances between echoes
 FAR_DB = 40.0
 MULTIPLE_EARLY_CYCLES = 1.6  # a multiple carries the pulse's delay once, its prediction from the first echo twice
 MULTIPLE_TOLERANCE_S = 2e-7
+REPEATED = 0.5  # of the likeness of a place to that of a multiple: beyond, an echo there is not compared with others
 REVERBERATION_TOLERANCE_S = 2.5e-7
 
 NAMES = (
@@ -39,7 +40,9 @@ def line_features(
     snr = np.where(valid, snr, np.float32(-FAR_DB))
     pair = snr[:, None, :] - snr[:, :, None]  # [line, one, other]: how much stronger the other is
     gap = depth[:, None, :] - depth[:, :, None]
-    both = valid[:, None, :] & valid[:, :, None]
+    multiple, share = _multiples(candidates, forerun, nominal_skin_s, transducer_hz, valid)
+    real = valid & (multiple < REPEATED)  # the forerun's own repetitions say nothing about the tissue's echoes
+    both = real[:, None, :] & valid[:, :, None]
     before, behind = both & (gap < -0.3), both & (gap > 0.3)
     best_before, far_before, which_before = _strongest(pair, gap, before)
     best_behind, far_behind, which_behind = _strongest(pair, gap, behind)
@@ -49,7 +52,6 @@ def line_features(
         np.where(where.any(axis=2), frequency - frequency[rows, which], 0.0)
         for where, which in ((before, which_before), (behind, which_behind))
     ]
-    multiple, share = _multiples(candidates, forerun, nominal_skin_s, transducer_hz, valid)
     reverberation, own = _reverberations(candidates, pair, before)
     seen = forerun.amplitude[:, None] > 0
     over_forerun = np.where(
@@ -58,14 +60,14 @@ def line_features(
     megahertz = transducer_hz * 1e-6
     stretches = np.stack([candidates.before_db, candidates.after_db, candidates.before_all_db, candidates.after_all_db])
     levels = np.clip(np.nan_to_num(stretches, nan=0.0), -5, 60)
-    ordered = np.sort(snr, axis=1)
+    strongest = np.where(real, snr, np.float32(-FAR_DB)).max(axis=1, keepdims=True, initial=-FAR_DB)
     features = [
         snr / 20, candidates.saliences_db / 10, levels[0] / 10, levels[1] / 10, levels[2] / 10, levels[3] / 10,
         (levels[0] - levels[1]) / 10, (levels[2] - levels[3]) / 10, best_before / 15, far_before / 5,
         best_behind / 15, far_behind / 5, depth / 8, depth * megahertz / 50, multiple, share / 15, over_forerun / 30,
         np.broadcast_to(seen, snr.shape).astype(float), reverberation / 15, candidates.widths_s * transducer_hz,
         (before & (pair > -8)).sum(axis=2) / 3.0, (behind & (pair > -8)).sum(axis=2) / 3.0,
-        np.broadcast_to(ordered[:, -1:], snr.shape) / 20, (ordered[:, -1:] - snr) / 15,
+        np.broadcast_to(strongest, snr.shape) / 20, (strongest - snr) / 15,
         frequency * 5, lower[0] * 5, lower[1] * 5, candidates.rise_db / 15, candidates.fall_db / 15,
         candidates.end_db / 15, own / 15,
     ]  # fmt: skip

@@ -1,8 +1,15 @@
-"""Which echo is the bone: probabilities of all candidates of a line, and of none of them."""
+"""Which echo is the bone: each line judged with the whole recording around it.
+
+What one recording shares speaks in every line: how strong bone echoes and with which polarity, where the neighbouring lines
+see it, what repeats at every place and so belongs to the probe. Each judgement sharpens what is known of the others, so it is
+done in turns.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -10,52 +17,20 @@ from CranioNavLib.rigid import Array
 from scipy.ndimage import gaussian_filter1d
 
 from ModuleUltrasoundLib.echo_candidates import DECIBEL, Candidates
+from ModuleUltrasoundLib.echo_network import Likelihood, probabilities
 from ModuleUltrasoundLib.echo_search import Found
 
 SAME_MM = 0.35  # SD of a hand's tremor along the beam from line to line: how near candidates support each other
 BIN_MM = 0.2
 REACH = 4  # neighbouring lines on each side
-ROWS = 256  # lines whose scores are worked out at once: the layers stay in the processor's cache
+FAR_REACH = 20  # the same, of a long stay or a slow glide
+SAME_FAR_MM = 0.6  # the bone's depth wanders over so many
+USUAL_MM = 1.2  # the scalp of a head is about as thick from place to place
+SURE = 0.85
 LEAST_FOR_SHARED = 3  # lines with a likely bone before anything is learnt from the recording
 
 
-Table = tuple[tuple[tuple[tuple[float, ...], ...], tuple[float, ...]], ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Network:
-    """A small perceptron that turns a candidate's features into its log-odds against "no bone"."""
-
-    layers: tuple[tuple[Array, Array], ...]  # weights (in, out) and biases (out,)
-
-    @classmethod
-    def from_table(cls, table: Table) -> Network:
-        """The network whose numbers stand in a table (see echo_weights.py)."""
-        return cls(tuple((np.array(weights, dtype=np.float32), np.array(biases, dtype=np.float32)) for weights, biases in table))
-
-    def scores(self, features: Array) -> Array:
-        """Log-odds (n, K) of features (n, K, D)."""
-        values = np.empty(features.shape[:-1], dtype=float)
-        for start in range(0, len(features), ROWS):
-            x = np.asarray(features[start : start + ROWS], dtype=np.float32)
-            for weights, biases in self.layers[:-1]:
-                x = np.asarray(x @ weights, dtype=np.float32)
-                x += biases
-                np.maximum(x, 0, out=x)  # cheaper than a smooth kink, and as good
-            weights, biases = self.layers[-1]
-            values[start : start + ROWS] = (x @ weights + biases)[..., 0]
-        return values
-
-
-def probabilities(scores: Array, valid: Array) -> tuple[Array, Array]:
-    """Softmax over the candidates and "none": probability of each candidate (n, K), and of none (n,)."""
-    scores = np.where(valid, scores, -np.inf)
-    top = np.maximum(scores.max(axis=1, initial=0.0), 0.0)[:, None]
-    weight = np.exp(scores - top)
-    none = np.exp(-top)
-    total = weight.sum(axis=1, keepdims=True) + none
-    return weight / total, (none / total)[:, 0]
-
+Real = TypeVar("Real", bound="np.floating[Any]")
 
 SHARED_NAMES = (
     "single",
@@ -69,36 +44,198 @@ SHARED_NAMES = (
     "slope",
     "chance",
     "rival support",
+    "long support",
+    "rival long support",
+    "presence",
+    "elsewhere",
+    "elsewhere known",
+    "none around",
+    "none in all",
+    "neighbours",
+    "usual depth",
+    "clear in all",
+    "sure in all",
+    "support in all",
+    "strength spread",
 )
 
 
-def shared_features(found: Found, scores: Array, runs: npt.NDArray[np.int64]) -> Array:
+def judge_echoes(found: Found, likelihood: Likelihood, runs: npt.NDArray[np.int64]) -> tuple[Array, Array]:
+    """Probability (n, K) of each candidate to be the bone, and the last turn's shared features (n, K, len(SHARED_NAMES)).
+
+    `found` holds the scores of the likelihood's first network.
+    """
+    scores, echoes = found.scores, Echoes.of(found.depths_mm, runs)
+    shared = shared_features(found, scores, runs, echoes)
+    for turn, network in enumerate(likelihood.networks[1:]):
+        if turn:
+            shared = shared_features(found, scores, runs, echoes)
+        scores = network.scores(np.concatenate([found.features, shared], axis=-1))
+    chance, _ = probabilities(scores, np.isfinite(found.depths_mm))
+    return chance, shared
+
+
+def shared_features(found: Found, scores: Array, runs: npt.NDArray[np.int64], echoes: Echoes | None = None) -> Array:
     """Features (n, K, len(SHARED_NAMES)) of each candidate from all lines of the recording.
 
-    `runs` (n,) numbers stretches of consecutive frames from one place on the head, which may support each other.
+    `scores` (n, K) are the log-odds so far. `runs` (n,) numbers stretches of consecutive frames from one place on the head,
+    which may support each other; `echoes` says where echoes are at all (worked out if not given).
     """
     candidates, depth_mm = found.candidates, found.depths_mm
     valid = np.isfinite(depth_mm)
-    chance, _ = probabilities(scores, valid)
+    if not valid.size:
+        return np.zeros((*valid.shape, len(SHARED_NAMES)), dtype=np.float32)
+    echoes = echoes or Echoes.of(depth_mm, runs)
+    chance, none = probabilities(scores, valid)
     strength, strength_known, slope = relative_strength(candidates, chance, depth_mm)
     polarity, polarity_known = relative_polarity(candidates.phases - found.forerun_phases[:, None], chance)
-    support, neighbours = neighbour_support(chance, depth_mm, runs)
+    near, far = Neighbours.within(runs, REACH), Neighbours.within(runs, FAR_REACH)
+    likely = DepthMap.of(chance, depth_mm)
+    support, far_support = likely.mean(near, SAME_MM), likely.mean(far, SAME_FAR_MM)
+    best, rows = chance.argmax(axis=1), np.arange(len(chance))
+    top = chance[rows, best]
+    values = {
+        "single": np.clip(scores, -8, 8) / 4,
+        "strength": strength,
+        "strength known": strength_known,
+        "polarity": polarity,
+        "polarity known": polarity_known,
+        "support": support,
+        "has neighbours": (near.number > 0)[:, None],
+        "contact": contact(found.forerun.amplitude)[:, None],
+        "slope": slope / 3,
+        "chance": chance,
+        "rival support": _rival(support),
+        "long support": far_support,
+        "rival long support": _rival(far_support),
+        "presence": echoes.presence,
+        "elsewhere": echoes.elsewhere,
+        "elsewhere known": echoes.elsewhere_known,
+        "none around": near.mean(none[:, None]),
+        "none in all": none.mean(),
+        "neighbours": far.number[:, None] / FAR_REACH,
+        "usual depth": likely.mean(None, USUAL_MM),
+        "clear in all": top.mean(),
+        "sure in all": (top > SURE).mean(),
+        "support in all": (top * support[rows, best]).sum() / max(top.sum(), 1e-6),
+        "strength spread": np.sqrt((top * strength[rows, best] ** 2).sum() / max(top.sum(), 1e-6)),
+    }
+    stacked = np.zeros((*valid.shape, len(SHARED_NAMES)), dtype=np.float32)
+    for number, name in enumerate(SHARED_NAMES):
+        stacked[..., number] = values[name]
+    stacked[~valid] = 0
+    return np.nan_to_num(stacked, copy=False)
+
+
+def _rival(support: Array) -> Array:
+    """The best support of the other candidates."""
     order = np.sort(support, axis=1)
-    rival = np.where(support == order[:, -1:], order[:, -2:-1], order[:, -1:])
-    features = [
-        np.clip(scores, -8, 8) / 4,
-        strength,
-        np.full(scores.shape, strength_known),
-        polarity,
-        np.full(scores.shape, polarity_known),
-        support,
-        np.broadcast_to(neighbours[:, None], scores.shape),
-        np.broadcast_to(contact(found.forerun.amplitude)[:, None], scores.shape),
-        np.full(scores.shape, slope / 3),
-        chance,
-        rival,
-    ]
-    return np.nan_to_num(np.stack([np.where(valid, feature, 0.0) for feature in features], axis=-1))
+    return np.where(support == order[:, -1:], order[:, -2:-1], order[:, -1:])
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbours:
+    """The lines [first, last) that each of n lines is compared with, itself left out."""
+
+    first: npt.NDArray[np.int64]
+    last: npt.NDArray[np.int64]
+
+    @classmethod
+    def within(cls, runs: npt.NDArray[np.int64], reach: int) -> Neighbours:
+        """Up to `reach` lines on each side, of the same run."""
+        index = np.arange(len(runs))
+        start, stop = np.searchsorted(runs, runs), np.searchsorted(runs, runs, side="right")
+        return cls(np.maximum(index - reach, start), np.minimum(index + reach + 1, stop))
+
+    @property
+    def number(self) -> npt.NDArray[np.int64]:
+        """How many (n,)."""
+        return self.last - self.first - 1
+
+    def mean(self, values: Array) -> Array:
+        """Mean (n, M) over the neighbours of values (n, M); 0 without any."""
+        return self.mean_of(values, running_sums(values))
+
+    def mean_of(self, values: npt.NDArray[Real], sums: npt.NDArray[Real]) -> npt.NDArray[Real]:
+        """As mean, of values whose running sums are known."""
+        total = sums[self.last]
+        total -= sums[self.first]
+        total -= values
+        total *= (1 / np.maximum(self.number, 1)[:, None]).astype(total.dtype)
+        return total
+
+
+def running_sums(values: npt.NDArray[Real]) -> npt.NDArray[Real]:
+    """Sums (n + 1, M) of the first 0, 1, ... n of values (n, M)."""
+    sums = np.zeros((len(values) + 1, values.shape[1]), dtype=values.dtype)
+    np.cumsum(values, axis=0, out=sums[1:])
+    return sums
+
+
+@dataclass(frozen=True, eq=False)
+class DepthMap:
+    """Weights of the candidates of n lines, entered at their depths."""
+
+    bins: npt.NDArray[np.int64]  # (n, K) of each candidate; -1: none
+    values: npt.NDArray[np.float32]  # (n, M)
+    sums: npt.NDArray[np.float32]  # (n + 1, M) running over the lines
+
+    @classmethod
+    def of(cls, weight: Array, depth_mm: Array) -> DepthMap:
+        """The map of weights (n, K) that belong to depths (n, K)."""
+        bins = np.nan_to_num(depth_mm / BIN_MM, nan=-1.0).astype(np.int64)
+        rows = np.arange(len(bins))
+        values = np.zeros((len(bins), int(bins.max(initial=0)) + 2), dtype=np.float32)
+        for rank in range(bins.shape[1]):  # one after the other, because two candidates may share a bin
+            values[rows, bins[:, rank]] += np.where(bins[:, rank] >= 0, weight[:, rank], 0)
+        values[:, -1] = 0
+        return cls(bins, values, running_sums(values))
+
+    def mean(self, neighbours: Neighbours | None, same_mm: float) -> Array:
+        """Mean weight (n, K) that the neighbours (None: all other lines) of each line give to its candidates' depths.
+
+        It counts fully at the very depth, less by a Gaussian of `same_mm`.
+        """
+        count, size = self.values.shape
+        if count < 2:
+            return np.zeros(self.bins.shape)
+        if neighbours is None:
+            mean = (self.sums[-1] - self.values) * np.float32(1 / (count - 1))
+        else:
+            mean = neighbours.mean_of(self.values, self.sums)
+        blurred = mean @ _blur(size, same_mm)
+        return np.where(self.bins >= 0, np.take_along_axis(blurred, np.clip(self.bins, 0, None), axis=1), 0.0)
+
+
+@lru_cache(maxsize=16)
+def _blur(size: int, same_mm: float) -> npt.NDArray[np.float32]:
+    """Matrix (M, M) that spreads a weight by a Gaussian of height 1, cut off at two standard deviations."""
+    sigma = same_mm / BIN_MM
+    kernel = gaussian_filter1d(np.eye(size), sigma, axis=1, mode="constant", truncate=2.0)
+    return np.asarray(kernel * (np.sqrt(2 * np.pi) * sigma), dtype=np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Echoes:
+    """Where echoes are at all, whatever they may be; what also shows at other places is an artefact of the probe."""
+
+    presence: Array  # (n, K) share of the neighbours with an echo at this depth
+    elsewhere: Array  # (n, K) share of the lines from other places with one
+    elsewhere_known: Array  # (n, 1) 0 to 1: enough of them
+
+    @classmethod
+    def of(cls, depth_mm: Array, runs: npt.NDArray[np.int64]) -> Echoes:
+        """Of candidates at depths (n, K), NaN where there is none, in lines of `runs` (n,)."""
+        here = DepthMap.of(np.isfinite(depth_mm).astype(float), depth_mm)
+        own = Neighbours.within(runs, len(runs))
+        all_others = max(len(runs) - 1, 0)
+        others = (all_others - own.number)[:, None]
+        elsewhere = here.mean(None, SAME_MM) * all_others - here.mean(own, SAME_MM) * own.number[:, None]
+        return cls(
+            here.mean(Neighbours.within(runs, REACH), SAME_MM),
+            np.clip(elsewhere / np.maximum(others, 1), 0, 2),
+            np.minimum(others / 10, 1),
+        )
 
 
 def relative_strength(candidates: Candidates, chance: Array, depth_mm: Array) -> tuple[Array, float, float]:
@@ -139,32 +276,6 @@ def relative_polarity(phases: Array, chance: Array) -> tuple[Array, float]:
     length = float(np.abs(mean))
     known = max(0.0, (length - 0.3) / 0.7) * float(min(weight.sum() / 10, 1.0))
     return np.cos(phases - np.angle(mean)) * known, known
-
-
-def neighbour_support(chance: Array, depth_mm: Array, runs: npt.NDArray[np.int64]) -> tuple[Array, Array]:
-    """Mean chance (n, K) that the neighbouring lines give to the same depth, and whether a line has neighbours (n,)."""
-    count = len(chance)
-    rows = np.arange(count)
-    if count < 2:
-        return np.zeros(chance.shape), np.zeros(count)
-    bins = np.nan_to_num(depth_mm / BIN_MM, nan=-1.0).astype(np.int64)
-    size = int(bins.max(initial=0)) + 2
-    spread = np.zeros((count, size), dtype=np.float32)
-    for rank in range(chance.shape[1]):  # one after the other, because two candidates may share a bin
-        spread[rows, bins[:, rank]] += np.where(bins[:, rank] >= 0, chance[:, rank], 0)
-    spread[:, -1] = 0
-    spread = gaussian_filter1d(spread, SAME_MM / BIN_MM, axis=1, mode="constant", truncate=2.0)
-    spread *= np.sqrt(2 * np.pi) * SAME_MM / BIN_MM  # a neighbour at the very depth counts fully
-    support = np.zeros_like(spread)
-    number = np.zeros(count)
-    for step in range(1, min(REACH, count - 1) + 1):
-        same = (runs[step:] == runs[:-step]).astype(np.float32)
-        support[step:] += spread[:-step] * same[:, None]
-        support[:-step] += spread[step:] * same[:, None]
-        number[step:] += same
-        number[:-step] += same
-    taken = np.take_along_axis(support, np.clip(bins, 0, None), axis=1) / np.maximum(number, 1)[:, None]
-    return np.where(bins >= 0, taken, 0.0), (number > 0).astype(float)
 
 
 def contact(amplitude: Array) -> Array:

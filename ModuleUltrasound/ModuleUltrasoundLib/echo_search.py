@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Optional
 
 import numpy as np
 import numpy.typing as npt
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array
-from CranioNavLib.sequence_metafile import Recording
+from CranioNavLib.sequence_metafile import Acquisition, Recording
 
 from ModuleUltrasoundLib.echo_candidates import Candidates, concatenate, find_candidates, reorder, rough_noise, take_levels
 from ModuleUltrasoundLib.echo_features import line_features
 from ModuleUltrasoundLib.echo_timing import BEFORE, BEHIND, Complexes
-from ModuleUltrasoundLib.signal_chain import Envelopes, check_acquisition, complex_envelopes, design_band
+from ModuleUltrasoundLib.signal_chain import Band, Envelopes, check_acquisition, complex_envelopes, design_band
 from ModuleUltrasoundLib.signal_forerun import Forerun, find_forerun, nominal_skin_s, steady, suppress_multiples
 
 BANG_SAMPLES = 40  # ten cycles
@@ -59,6 +60,18 @@ def check_length(recording: Recording, speed_m_s: float, least_depth_mm: float) 
 Rank = Callable[[Array], Array]  # features (n, K, D) -> scores (n, K)
 
 
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What to look for, and where."""
+
+    acquisition: Acquisition
+    speed_m_s: float
+    window_s: tuple[float, float]  # (least, most) behind the skin
+    band: Band
+    several_spots: bool
+    rank: Optional[Rank]
+
+
 def search_lines(
     recording: Recording, speed_m_s: float, depth_mm: tuple[float, float], several_spots: bool, rank: Rank | None = None
 ) -> Found:
@@ -78,56 +91,63 @@ def search_lines(
         raise InputError("the recording holds no RF samples, only poses; record the A-lines with them (DimSize = N 1 F)")
     per_s = 500.0 * speed_m_s  # mm of depth a second of delay
     window = (depth_mm[0] / per_s, depth_mm[1] / per_s)
-    skin = nominal_skin_s(acquisition)
-    band = design_band(acquisition, recording.lines.shape[1], skin * 1.04 + window[1] + BEHIND_S)
-    found: list[Candidates] = []
-    foreruns: list[Forerun] = []
-    phases: list[Array] = []
-    features: list[Array] = []
-    scores: list[Array] = []
-    windows: list[Complexes] = []
-    bang = np.zeros(BANG_SAMPLES, dtype=np.complex128)
-    parts = max(-(-len(recording) // CHUNK), 1)
-    for lines in np.array_split(recording.lines, parts):
-        envelopes = complex_envelopes(lines, band)
-        magnitude = np.abs(envelopes.values)
-        start = envelopes.values[:, :BANG_SAMPLES].sum(axis=0)
-        bang[: len(start)] += start
-        forerun = find_forerun(envelopes, magnitude, rough_noise(magnitude), acquisition)
-        if several_spots and skin > 0:
-            suppress_multiples(envelopes, magnitude, forerun, acquisition)
-        levels = take_levels(magnitude)
-        candidates = find_candidates(envelopes, magnitude, levels, forerun.skin_s, window, acquisition.transducer_hz)
-        feature = line_features(candidates, forerun, skin, acquisition.transducer_hz, speed_m_s)
-        score = np.zeros(feature.shape[:2]) if rank is None else rank(feature)
-        if rank is not None:
-            order = np.argsort(-np.where(np.isfinite(candidates.delays_s), score, -np.inf), axis=1, kind="stable")
-            candidates, score = reorder(candidates, order), np.take_along_axis(score, order, axis=1)
-            feature = np.take_along_axis(feature, order[..., None], axis=1)
-        scores.append(score)
-        found.append(candidates)
-        foreruns.append(forerun)
-        phases.append(_forerun_phases(envelopes, forerun))
-        features.append(feature)
-        windows.append(_cut_windows(envelopes, candidates.delays_s[:, :KEPT] + forerun.skin_s[:, None]))
-    candidates = concatenate(found)
+    band = design_band(acquisition, recording.lines.shape[1], nominal_skin_s(acquisition) * 1.04 + window[1] + BEHIND_S)
+    search = Search(acquisition, speed_m_s, window, band, several_spots, rank)
+    parts = np.array_split(recording.lines, max(-(-len(recording) // CHUNK), 1))
+    found = [_search_batch(lines, search) for lines in parts]
+    candidates = concatenate([part.candidates for part in found])
     forerun = Forerun(
-        **{name: np.concatenate([getattr(part, name) for part in foreruns]) for name in Forerun.__dataclass_fields__}
+        **{name: np.concatenate([getattr(part.forerun, name) for part in found]) for name in Forerun.__dataclass_fields__}
     )
     calm = steady(forerun)
     candidates = replace(candidates, delays_s=candidates.delays_s + (forerun.skin_s - calm.skin_s)[:, None])
     turned = 2 * np.pi * band.carrier_hz * (calm.skin_s - forerun.skin_s)
+    bang = np.sum([part.bang for part in found], axis=0) / max(len(recording), 1)
     return Found(
         candidates,
         calm,
-        np.concatenate(phases) + np.where(calm.found, turned, 0.0),
-        np.concatenate(features),
-        np.concatenate(scores),
+        np.concatenate([part.forerun_phases for part in found]) + np.where(calm.found, turned, 0.0),
+        np.concatenate([part.features for part in found]),
+        np.concatenate([part.scores for part in found]),
         candidates.delays_s * per_s,
-        np.concatenate(windows),
-        np.asarray(bang / max(len(recording), 1), dtype=np.complex128),
+        np.concatenate([part.windows for part in found]),
+        np.asarray(bang, dtype=np.complex128),
         band.rate_hz,
         band.carrier_hz,
+    )
+
+
+def _search_batch(lines: npt.NDArray[np.int16], search: Search) -> Found:
+    """The echoes of some lines; `bang` is the sum over them."""
+    acquisition, rank = search.acquisition, search.rank
+    envelopes = complex_envelopes(lines, search.band)
+    magnitude = np.abs(envelopes.values)
+    bang = np.zeros(BANG_SAMPLES, dtype=np.complex128)
+    start = envelopes.values[:, :BANG_SAMPLES].sum(axis=0)
+    bang[: len(start)] = start
+    skin = nominal_skin_s(acquisition)
+    forerun = find_forerun(envelopes, magnitude, rough_noise(magnitude), acquisition)
+    if search.several_spots and skin > 0:
+        suppress_multiples(envelopes, magnitude, forerun, acquisition)
+    levels = take_levels(magnitude)
+    candidates = find_candidates(envelopes, magnitude, levels, forerun.skin_s, search.window_s, acquisition.transducer_hz)
+    features = line_features(candidates, forerun, skin, acquisition.transducer_hz, search.speed_m_s)
+    scores = np.zeros(features.shape[:2]) if rank is None else rank(features)
+    if rank is not None:
+        order = np.argsort(-np.where(np.isfinite(candidates.delays_s), scores, -np.inf), axis=1, kind="stable")
+        candidates, scores = reorder(candidates, order), np.take_along_axis(scores, order, axis=1)
+        features = np.take_along_axis(features, order[..., None], axis=1)
+    return Found(
+        candidates,
+        forerun,
+        _forerun_phases(envelopes, forerun),
+        features,
+        scores,
+        candidates.delays_s * 500.0 * search.speed_m_s,
+        _cut_windows(envelopes, candidates.delays_s[:, :KEPT] + forerun.skin_s[:, None]),
+        bang,
+        envelopes.rate_hz,
+        envelopes.carrier_hz,
     )
 
 

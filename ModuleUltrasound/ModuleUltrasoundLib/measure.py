@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -13,11 +12,11 @@ from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Recording
 
 from ModuleUltrasoundLib.depth import bone_positions, covariances
-from ModuleUltrasoundLib.echo_likelihood import SHARED_NAMES, Network, probabilities, shared_features
+from ModuleUltrasoundLib.echo_likelihood import SHARED_NAMES, judge_echoes
+from ModuleUltrasoundLib.echo_network import Likelihood, learnt
 from ModuleUltrasoundLib.echo_onset import pulse_delay
 from ModuleUltrasoundLib.echo_search import Found, search_lines
 from ModuleUltrasoundLib.echo_timing import time_echoes
-from ModuleUltrasoundLib.echo_weights import QUALITY, SHARED, SINGLE
 from ModuleUltrasoundLib.measure_points import bone_points as bone_points
 from ModuleUltrasoundLib.quality import CLIPPED_SHARE, TOLERANCE_MM, choose, clipped_share, quality_of, reasons_of, unstable
 
@@ -34,7 +33,7 @@ class EchoSettings(Parameters):
     speed_of_sound_sd_m_s: Annotated[float, Limits(0, 200), "speed of sound in the tissue: SD of the prior"] = 52.0
     least_depth_mm: Annotated[float, Limits(0, 20), "no bone is looked for above this depth"] = 1.4
     most_depth_mm: Annotated[float, Limits(2, 60), "no bone is looked for below this depth"] = 20.0
-    quality_gate: Annotated[float, Limits(0, 1), "frames below this quality are not points"] = 0.9
+    quality_gate: Annotated[float, Limits(0, 1), "frames below this quality are not points"] = 0.93
     beam_width_mm: Annotated[float, Limits(0, 10), "-6 dB width of the beam"] = 1.2
     tilt_sd_deg: Annotated[float, Limits(0, 20), "SD of the angle between beam and bone normal"] = 2.0
 
@@ -74,19 +73,12 @@ def stays(recording: Recording) -> npt.NDArray[np.int64]:
     return np.cumsum(jump)
 
 
-@dataclass(frozen=True, eq=False)
-class Likelihood:
-    """What was learnt about bone echoes (see echo_weights.py)."""
-
-    single: Network  # of a line by itself
-    both: Network  # with the recording around it
-    quality: tuple[Array, Array]  # quality before calibration, and the share that was right: knots
-
-
-@lru_cache(maxsize=1)
-def learnt() -> Likelihood:
-    """The likelihood that was calibrated on simulated lines."""
-    return Likelihood(Network.from_table(SINGLE), Network.from_table(SHARED), (np.array(QUALITY[0]), np.array(QUALITY[1])))
+def several_spots(recording: Recording, runs: npt.NDArray[np.int64]) -> bool:
+    """Whether the lines come from several places on the head: after a jump, or along a glide."""
+    origin = recording.probe_to_reference[:, :3, 3]
+    known = origin[np.isfinite(origin).all(axis=1)]
+    strayed = len(known) > 1 and float(np.linalg.norm(known - np.median(known, axis=0), axis=1).max()) > SAME_SPOT_MM
+    return bool(runs.max(initial=0) >= 2) or strayed
 
 
 def measure_lines(
@@ -106,12 +98,10 @@ def measure_lines(
         recording,
         settings.speed_of_sound_m_s,
         (settings.least_depth_mm, settings.most_depth_mm),
-        several_spots=bool(runs.max(initial=0) >= 2),
-        rank=likelihood.single.scores,
+        several_spots=several_spots(recording, runs),
+        rank=likelihood.networks[0].scores,
     )
-    shared = shared_features(found, found.scores, runs)
-    scores = likelihood.both.scores(np.concatenate([found.features, shared], axis=-1))
-    chance, _ = probabilities(scores, np.isfinite(found.depths_mm))
+    chance, shared = judge_echoes(found, likelihood, runs)
     best = choose(found.depths_mm, chance)
     shift_s, sd_s = time_of(found, best, chance, recording.acquisition.transducer_hz)
     return assemble(recording, settings, found, chance, best, shift_s, sd_s, runs, shared, likelihood.quality)

@@ -2,29 +2,38 @@
 
     python -m Testing.Benchmarks.echo --worlds 300 --seed 7
 
-The recordings are drawn like those of the calibration, half of them from each family (Testing/Studies/echo_lines.py and
-tissue_lines.py), with other seeds. Depths are judged with the true speed of sound given.
+The recordings are drawn like those of the calibration, from each of its families (Testing/Studies/echo_lines.py,
+tissue_lines.py, bench_lines.py, and plain_lines.py, which no network is fitted to), with other seeds. Depths are judged with
+the true speed of sound given.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from CranioNavLib.sequence_metafile import Acquisition, Recording
 from ModuleUltrasoundLib.measure import EchoSettings, measure_lines
 
-from Testing.Studies import tissue_lines
+from Testing.Studies import bench_lines, plain_lines, tissue_lines
 from Testing.Studies.echo_lines import draw_world, simulate
 
 Array = npt.NDArray[np.float64]
 FRAMES = 40
-SYMMETRIC = ("gauss", "ricker", "hann", "chirp")
+SYMMETRIC = ("gauss", "ricker", "hann", "chirp", "symmetric")
+SIMULATORS: dict[str, Callable[..., Any]] = {
+    "tissue_lines": tissue_lines.simulate,
+    "bench_lines": bench_lines.simulate,
+    "plain_lines": plain_lines.simulate,
+}
+FAMILIES = ("echo_lines", *SIMULATORS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,13 +61,13 @@ def measure_world(seed: int, family: str = "echo_lines") -> Judged:
         recording, truth, world = simulate(rng, FRAMES)
         each_line = world.snr_per_line
     else:
-        recording, truth, world = tissue_lines.simulate(rng, FRAMES)  # type: ignore[assignment]
-        each_line = world.snr_of == "line"  # type: ignore[attr-defined]
+        recording, truth, world = SIMULATORS[family](rng, FRAMES)
+        each_line = getattr(world, "snr_of", "line") == "line"
     lines = measure_lines(recording, EchoSettings(speed_of_sound_m_s=truth.speed_m_s))
     return Judged(
         family,
         recording.acquisition,
-        world.pulse,
+        pulse_of(world),
         world.attenuation,
         world.snr_db,
         each_line,
@@ -69,6 +78,13 @@ def measure_world(seed: int, family: str = "echo_lines") -> Judged:
         lines.accepted,
         truth.snr_db,
     )
+
+
+def pulse_of(world: Any) -> str:
+    """The kind of its pulse."""
+    if isinstance(world, bench_lines.Bench):
+        return "symmetric" if world.symmetric else "struck"
+    return str(getattr(world, "pulse", "gauss"))
 
 
 def rates(judged: list[Judged]) -> dict[str, float]:
@@ -164,7 +180,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--jobs", type=int, default=2)
     options = parser.parse_args()
-    for family in ("echo_lines", "tissue_lines"):
+    for family in FAMILIES:
         seeds = [options.seed * 1_000_003 + i for i in range(options.worlds)]
         with ProcessPoolExecutor(options.jobs) as pool:
             judged = list(pool.map(partial(measure_world, family=family), seeds, chunksize=4))

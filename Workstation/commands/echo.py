@@ -22,6 +22,7 @@ def echo(
 
     from CranioNavLib.sequence_metafile import read_recording
     from ModuleUltrasoundLib.echo_search import check_length
+    from ModuleUltrasoundLib.forerun_check import forerun_remark
     from ModuleUltrasoundLib.measure import EchoSettings, measure_lines
     from ModuleUltrasoundLib.measure_table import write_depths_csv
     from ModuleUltrasoundLib.speed_of_sound import estimate_if_pressed
@@ -34,6 +35,7 @@ def echo(
         say("looking for bone", 0.3)
         settings = EchoSettings() if speed_of_sound is None else EchoSettings(speed_of_sound_m_s=speed_of_sound)
         check_length(lines, settings.speed_of_sound_m_s, settings.least_depth_mm)
+        remark = forerun_remark(lines)
         measured = measure_lines(lines, settings)
         say("writing", 0.95)
         write_depths_csv(output, lines, measured)
@@ -41,10 +43,12 @@ def echo(
     reasons = Counter(reason for reason, accepted in zip(measured.reasons, measured.accepted) if not accepted)
     if json:
         summary = {"depths": str(output), "lines": len(lines), "accepted": int(measured.accepted.sum()), "refused": dict(reasons)}
-        print_json({**summary, "speed_by_pressing": None if pressed is None else asdict(pressed)})
+        print_json({**summary, "remark": remark, "speed_by_pressing": None if pressed is None else asdict(pressed)})
         return
     print(f"{output}: {int(measured.accepted.sum())} of {len(lines)} lines show bone")
     for reason, count in reasons.most_common():
         print(f"  {count} refused: {reason}")
+    if remark:
+        print(remark)
     if pressed is not None:
         print(f"speed of sound by pressing: {pressed}")

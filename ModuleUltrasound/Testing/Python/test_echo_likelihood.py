@@ -1,42 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
-from ModuleUltrasoundLib.echo_likelihood import (
-    Network,
-    contact,
-    neighbour_support,
-    probabilities,
-    relative_polarity,
-)
-from scipy.special import softmax
-
-
-@settings(max_examples=50, deadline=None)
-@given(arrays(float, (4, 5), elements=st.floats(-800, 800)))
-def test_probabilities_are_a_softmax_with_none_as_a_choice(scores):
-    valid = np.ones(scores.shape, dtype=bool)
-    valid[0, 3] = False
-    chance, none = probabilities(scores, valid)
-    expected = softmax(np.column_stack([np.where(valid, scores, -np.inf), np.zeros(4)]), axis=1)
-    assert chance == pytest.approx(expected[:, :-1], abs=1e-12)
-    assert none == pytest.approx(expected[:, -1], abs=1e-12)
-
-
-def test_line_without_candidates_has_no_bone():
-    chance, none = probabilities(np.full((1, 3), 5.0), np.zeros((1, 3), dtype=bool))
-    assert chance.sum() == 0
-    assert none[0] == 1
-
-
-def test_network_is_a_plain_perceptron():
-    rng = np.random.default_rng(0)
-    layers = tuple((rng.normal(size=(a, b)), rng.normal(size=b)) for a, b in ((3, 4), (4, 1)))
-    x = rng.normal(size=(2, 5, 3))
-    expected = np.maximum(x @ layers[0][0] + layers[0][1], 0) @ layers[1][0][:, 0] + layers[1][1][0]
-    table = tuple((tuple(map(tuple, w)), tuple(b)) for w, b in layers)
-    assert Network.from_table(table).scores(x) == pytest.approx(expected, abs=1e-5)
+from ModuleUltrasoundLib.echo_likelihood import DepthMap, Echoes, Neighbours, contact, relative_polarity
 
 
 def test_polarity_is_that_of_the_likely_bones_and_silent_when_they_disagree():
@@ -53,13 +17,31 @@ def test_polarity_is_that_of_the_likely_bones_and_silent_when_they_disagree():
 def test_neighbours_of_the_same_stay_support_one_depth():
     depth = np.column_stack([np.full(9, 6.0), np.linspace(10, 18, 9)])
     chance = np.full((9, 2), 0.5)
-    support, has = neighbour_support(chance, depth, np.zeros(9, dtype=int))
+    support = DepthMap.of(chance, depth).mean(Neighbours.within(np.zeros(9, dtype=int), 4), 0.35)
     assert support[4, 0] == pytest.approx(0.5, rel=0.1)
     assert support[4, 1] < 0.05
-    assert has.all()
-    alone, none = neighbour_support(chance, depth, np.arange(9))
-    assert alone.max() == 0
-    assert not none.any()
+    assert DepthMap.of(chance, depth).mean(Neighbours.within(np.arange(9), 4), 0.35).max() == 0
+
+
+def test_neighbours_end_with_the_stay_and_the_reach_and_leave_the_line_itself_out():
+    runs = np.array([0, 0, 0, 0, 1, 1, 2])
+    neighbours = Neighbours.within(runs, 2)
+    values = np.arange(7.0)[:, None] ** 2
+    expected = []
+    for i in range(7):
+        others = [j for j in range(7) if j != i and runs[j] == runs[i] and abs(i - j) <= 2]
+        expected.append(np.mean([values[j, 0] for j in others]) if others else 0.0)
+    assert neighbours.mean(values)[:, 0] == pytest.approx(expected)
+
+
+def test_echo_that_shows_at_every_place_is_found_elsewhere_and_bone_of_one_place_is_not():
+    runs = np.repeat(np.arange(5), 4)
+    depth = np.column_stack([3.0 + 2.0 * runs, np.full(20, 14.5)])
+    echoes = Echoes.of(depth, runs)
+    assert echoes.presence == pytest.approx(np.ones((20, 2)), abs=0.05)
+    assert echoes.elsewhere[:, 0].max() < 0.05
+    assert echoes.elsewhere[:, 1] == pytest.approx(np.ones(20), abs=0.05)
+    assert (echoes.elsewhere_known == 1).all()
 
 
 def test_forerun_echo_in_air_stands_out_of_the_recording():

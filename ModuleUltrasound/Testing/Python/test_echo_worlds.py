@@ -1,9 +1,19 @@
-"""The detector over many simulated worlds of two families; the everyday suite takes a few of them."""
+"""The detector over many simulated worlds; the everyday suite takes a few of them."""
 
 import numpy as np
 import pytest
 
 from Testing.Benchmarks.echo import calibration, measure_world, rates
+
+
+@pytest.mark.slow
+def test_family_that_nothing_was_fitted_to_is_told_as_well_as_is_asked_for():
+    judged = [measure_world(90_000_000 + index, "plain_lines") for index in range(100)]
+    found = rates(judged)
+    assert found["within 0.5 mm"] >= 0.99
+    assert found["within 0.25 mm"] >= 0.95
+    assert found["accepted < 3 deg"] >= 0.9
+    assert found["accepted without bone"] < 0.01
 
 
 @pytest.mark.slow
@@ -21,7 +31,7 @@ def test_detector_stays_as_good_as_it_was_over_many_simulated_worlds(family):
     assert (np.abs(bins[:, 0] - bins[:, 1]) * bins[:, 2]).sum() / bins[:, 2].sum() < 0.03
 
 
-@pytest.mark.parametrize("family", ["echo_lines", "tissue_lines"])
+@pytest.mark.parametrize("family", ["echo_lines", "tissue_lines", "plain_lines"])
 def test_accepted_depths_are_right_in_a_few_simulated_worlds(family):
     found = rates([measure_world(91_000_000 + index, family) for index in range(6)])
     assert found["within 0.5 mm"] >= 0.98

@@ -5,7 +5,8 @@ import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition, Recording
-from ModuleUltrasoundLib.measure import EchoSettings, learnt, measure_lines, stays
+from ModuleUltrasoundLib.echo_network import learnt
+from ModuleUltrasoundLib.measure import EchoSettings, measure_lines, several_spots, stays
 
 SPEED = 1500.0
 
@@ -195,6 +196,17 @@ def test_stays_end_where_the_probe_jumps_or_the_point_changes():
     poses = recording.probe_to_reference.copy()
     poses[4, :3, 3] += 20
     assert stays(replace(recording, probe_to_reference=poses)).tolist() == [0, 0, 1, 1, 2, 3]
+
+
+def test_glide_of_centimetres_and_a_jump_are_several_spots_but_a_tremor_is_one():
+    recording = record(np.random.default_rng(12), np.full(6, 6.0), SET_UPS["5 MHz, polystyrene"], points=np.zeros(6, dtype=int))
+    poses = recording.probe_to_reference.copy()
+    assert not several_spots(recording, stays(recording))
+    poses[:, 0, 3] += 3.0 * np.arange(6)
+    glide = replace(recording, probe_to_reference=poses)
+    assert stays(glide).max() == 0
+    assert several_spots(glide, stays(glide))
+    assert several_spots(recording, np.array([0, 0, 1, 1, 2, 2]))
 
 
 @pytest.mark.parametrize("depth", [3.0, 9.0, 12.5])  # 14.7 is where this forerun repeats

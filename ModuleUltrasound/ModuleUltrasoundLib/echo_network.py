@@ -1,0 +1,95 @@
+"""The small networks that score echoes, and the numbers that were learnt for them (echo_weights.json)."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from CranioNavLib.rigid import Array
+
+WEIGHTS = Path(__file__).with_name("echo_weights.json")  # written by Testing/Studies/calibrate_echo.py
+ROWS = 256  # lines whose scores are worked out at once: the layers stay in the processor's cache
+
+Weights = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """A small perceptron that turns a candidate's features into its log-odds against "no bone"."""
+
+    layers: tuple[tuple[Weights, Weights], ...]  # weights (in, out) and biases (out,)
+
+    def scores(self, features: npt.NDArray[np.floating[Any]]) -> Array:
+        """Log-odds (n, K) of features (n, K, D)."""
+        values = np.empty(features.shape[:-1], dtype=float)
+        for start in range(0, len(features), ROWS):
+            x = np.asarray(features[start : start + ROWS], dtype=np.float32)
+            for weights, biases in self.layers[:-1]:
+                x = np.asarray(x @ weights, dtype=np.float32)
+                x += biases
+                np.maximum(x, 0, out=x)  # cheaper than a smooth kink, and as good
+            weights, biases = self.layers[-1]
+            values[start : start + ROWS] = (x @ weights + biases)[..., 0]
+        return values
+
+
+def probabilities(scores: Array, valid: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Softmax over the candidates and "none": probability of each candidate (n, K), and of none (n,)."""
+    scores = np.where(valid, scores, -np.inf)
+    top = np.maximum(scores.max(axis=1, initial=0.0), 0.0)[:, None]
+    weight = np.exp(scores - top)
+    none = np.exp(-top)
+    total = weight.sum(axis=1, keepdims=True) + none
+    return weight / total, (none / total)[:, 0]
+
+
+@dataclass(frozen=True, eq=False)
+class Likelihood:
+    """What was learnt about bone echoes.
+
+    The first network judges a line by itself; each further one judges it again with the recording around it, as the network
+    before it sees that recording.
+    """
+
+    networks: tuple[Network, ...]
+    quality: tuple[Array, Array]  # quality before calibration, and the share that was right: knots
+
+
+def read_likelihood(path: Path) -> Likelihood:
+    """The likelihood that `write_likelihood` has written."""
+    table = json.loads(path.read_text(encoding="utf-8"))
+    networks = tuple(
+        Network(tuple((np.array(one["weights"], dtype=np.float32), np.array(one["biases"], dtype=np.float32)) for one in layers))
+        for layers in table["networks"]
+    )
+    return Likelihood(networks, (np.array(table["quality"]["stated"]), np.array(table["quality"]["right"])))
+
+
+def write_likelihood(path: Path, likelihood: Likelihood, note: str) -> None:
+    """The likelihood as JSON, a row of numbers a line, four digits each."""
+    networks = ",\n".join(
+        "[\n"
+        + ",\n".join(
+            '{"weights": [\n' + ",\n".join(map(_row, weights)) + '],\n"biases": ' + _row(biases) + "}"
+            for weights, biases in network.layers
+        )
+        + "]"
+        for network in likelihood.networks
+    )
+    quality = f'{{"stated": {_row(likelihood.quality[0])},\n"right": {_row(likelihood.quality[1])}}}'
+    path.write_text(f'{{"note": {json.dumps(note)},\n"quality": {quality},\n"networks": [\n{networks}]}}\n', encoding="utf-8")
+
+
+def _row(values: npt.NDArray[np.floating[Any]]) -> str:
+    return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"
+
+
+@lru_cache(maxsize=1)
+def learnt() -> Likelihood:
+    """The likelihood that was calibrated on simulated lines."""
+    return read_likelihood(WEIGHTS)

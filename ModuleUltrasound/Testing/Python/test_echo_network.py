@@ -1,0 +1,59 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from ModuleUltrasoundLib.echo_network import Likelihood, Network, learnt, probabilities, read_likelihood, write_likelihood
+from scipy.special import softmax
+
+
+@settings(max_examples=50, deadline=None)
+@given(arrays(float, (4, 5), elements=st.floats(-800, 800)))
+def test_probabilities_are_a_softmax_with_none_as_a_choice(scores):
+    valid = np.ones(scores.shape, dtype=bool)
+    valid[0, 3] = False
+    chance, none = probabilities(scores, valid)
+    expected = softmax(np.column_stack([np.where(valid, scores, -np.inf), np.zeros(4)]), axis=1)
+    assert chance == pytest.approx(expected[:, :-1], abs=1e-12)
+    assert none == pytest.approx(expected[:, -1], abs=1e-12)
+
+
+def test_line_without_candidates_has_no_bone():
+    chance, none = probabilities(np.full((1, 3), 5.0), np.zeros((1, 3), dtype=bool))
+    assert chance.sum() == 0
+    assert none[0] == 1
+
+
+@pytest.fixture
+def a_network():
+    rng = np.random.default_rng(0)
+    sizes = ((3, 4), (4, 1))
+    return Network(
+        tuple((rng.normal(size=size).astype(np.float32), rng.normal(size=size[1]).astype(np.float32)) for size in sizes)
+    )
+
+
+def test_network_is_a_plain_perceptron(a_network):
+    (w, b), (v, c) = a_network.layers
+    x = np.random.default_rng(1).normal(size=(2, 5, 3))
+    assert a_network.scores(x) == pytest.approx(np.maximum(x @ w + b, 0) @ v[:, 0] + c[0], abs=1e-5)
+
+
+def test_likelihood_comes_back_from_its_file_to_four_digits(a_network, tmp_path):
+    quality = (np.array([0.0, 0.31, 1.0]), np.array([0.0, 0.25, 0.999]))
+    write_likelihood(tmp_path / "w.json", Likelihood((a_network, a_network), quality), 'a "note"')
+    back = read_likelihood(tmp_path / "w.json")
+    assert back.quality == (pytest.approx(quality[0]), pytest.approx(quality[1]))
+    assert len(back.networks) == 2
+    for (weights, biases), (w, b) in zip(back.networks[1].layers, a_network.layers):
+        assert weights.shape == w.shape
+        assert weights == pytest.approx(w, rel=5e-4)
+        assert biases == pytest.approx(b, rel=5e-4)
+
+
+def test_networks_that_were_learnt_take_the_features_that_are_made():
+    from ModuleUltrasoundLib.echo_features import NAMES
+    from ModuleUltrasoundLib.echo_likelihood import SHARED_NAMES
+
+    own, shared = len(NAMES), len(NAMES) + len(SHARED_NAMES)
+    assert [network.layers[0][0].shape[0] for network in learnt().networks] == [own] + [shared] * (len(learnt().networks) - 1)
