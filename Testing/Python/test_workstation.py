@@ -37,20 +37,20 @@ def prepare(user):
     user.sees("ct", "simulated patient: sample head")
     user.picture("1-ct")
     user.next("ct")
-    user.press("bone", "segmentBone")
+    user.follow("bone", "segmentBone")
     user.sees("bone", "on the outer table")
     user.picture("2-bone")
     user.next("bone")
-    user.press("devices", "connect", 0)
+    user.follow("devices", "connect")
     user.sees("devices", r"\d+ frames a second")
-    user.press("devices", "connect", 1)
+    user.follow("devices", "connect")
     user.sees("devices", r"[1-9]\d* lines")
     user.picture("3-devices")
     user.next("devices")
-    user.press("calibration", "pivotStylus")
+    user.follow("calibration", "pivotStylus")
     user.sees("calibration", "the hand pivots")
     user.page.wait_for_timeout(2500)
-    user.press("calibration", "startPivot")
+    user.follow("calibration", "startPivot")
     user.sees("calibration", r"SD \d+\.\d+ mm")
     user.picture("4-calibration")
     user.next("calibration")
@@ -59,22 +59,22 @@ def prepare(user):
 def register(user):
     """Landmarks and ultrasound points touched and registered."""
     user.digitise_landmarks()
-    user.press("landmarks", "registerLandmarks")
+    user.follow("landmarks", "registerLandmarks")
     user.sees("landmarks", r"4 landmark pairs, FRE \d")
     user.picture("5-landmarks")
     user.next("landmarks")
-    user.press("ultrasound", "planProtocol")
+    user.follow("ultrasound", "planProtocol")
     user.sees("ultrasound", "18 points")
-    user.press("ultrasound", "startRecording")
+    user.follow("ultrasound", "startRecording")
     user.sees("ultrasound", "recording into session")
-    user.press("ultrasound", "palpateAll")
+    user.follow("ultrasound", "palpateAll")
     user.page.wait_for_timeout(15_000)
     user.page.locator("[data-drawing=live] svg >> visible=true").first.wait_for()
     user.picture("6-ultrasound")
     user.sees("ultrasound", r"1[5-8] of 18 points")
     user.press("ultrasound", "stopRecording")
     user.sees("ultrasound", r"\d+ bone points from")
-    user.press("ultrasound", "registerSurface")
+    user.follow("ultrasound", "registerSurface")
     user.sees("ultrasound", "(accepted|warning): ")
     user.picture("6-registered")
     user.next("ultrasound")
@@ -82,26 +82,26 @@ def register(user):
 
 def verify_navigate_report(user):
     """What comes after the registration."""
-    user.press("verification", "measureTargets")
-    user.press("verification", "verify")
+    user.follow("verification", "measureTargets")
+    user.follow("verification", "verify")
     said = user.sees("verification", r"TRE \d+\.\d+ mm \(mean\)")
     assert float(re.search(r"TRE (\d+\.\d+) mm \(mean\)", said).group(1)) < 2.0  # simulated; the chapter's worst mode: 2.78
     user.picture("7-verification")
     user.next("verification")
     before = user.slices()
-    user.press("navigation", "tourTargets")
+    user.follow("navigation", "tourTargets")
     user.sees("navigation", r"To the bone\s+\d+\.\d mm")
     user.waits_until(lambda: all(now != then for now, then in zip(user.slices(), before, strict=True)))  # all follow the tip
     user.picture("8-navigation")
     user.next("navigation")
-    user.press("report", "writeReport")
+    user.follow("report", "writeReport")
     user.sees("report", "written; the registration from the files is the one on the screen")
     user.picture("9-report")
 
 
 @needs_browser
 @pytest.mark.slow
-def test_the_whole_procedure_is_done_by_clicks(tmp_path, pictures):
+def test_the_whole_procedure_is_done_by_following_the_bright_button(tmp_path, pictures):
     folder = tmp_path / "session"
     with served(folder) as (url, _), browsing(pictures) as user:
         user.open(url)

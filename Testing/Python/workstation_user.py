@@ -63,6 +63,10 @@ class User:
         button = self.page.locator(f"[data-panel={step}] [data-action={action}]").nth(which)
         button.and_(self.page.locator(":not([disabled])")).click()
 
+    def follow(self, step: str, action: str) -> None:
+        """Press the bright button at the top of a step once it is that one."""
+        self.page.locator(f"[data-panel={step}] [data-offer={action}]").click()
+
     def sees(self, step: str, text: str) -> str:
         """Wait until a text (a regular expression) stands in a step; the step's text."""
         self.page.locator(f"[data-panel={step}]").filter(has_text=re.compile(text)).wait_for()
