@@ -97,11 +97,29 @@ def verification_record(result: CaseResult) -> dict[str, Any]:
         "covariance": None if registration.covariance is None else registration.covariance.tolist(),
         "pivot_ras_mm": registration.pivot_ras_mm.tolist(),
         "degrees_of_freedom": registration.degrees_of_freedom,
+        "speed_of_sound": speed_record(result),
         "bone_surface": {
             "threshold_hu": result.bone.threshold_hu,
             "position_sd_mm": result.bone.position_sd_mm,
             "offset_sd_mm": result.bone.offset_sd_mm,
         },
+    }
+
+
+def speed_record(result: CaseResult) -> dict[str, Any] | None:
+    """The speed of sound by each way that tells of it, with its SD; None without ultrasound."""
+    if result.ultrasound is None:
+        return None
+    assumed, pressed = result.ultrasound.measurements, result.ultrasound.pressed
+    return {
+        "prior": {"m_s": assumed.speed_of_sound_m_s, "sd_m_s": assumed.speed_of_sound_sd_m_s},
+        "with_the_registration": {
+            "m_s": _known(result.registration.speed_of_sound_m_s),
+            "sd_m_s": _known(result.registration.speed_of_sound_sd_m_s),
+        },
+        "by_pressing": None
+        if pressed is None
+        else {"m_s": pressed.pressed_m_s, "sd_m_s": pressed.pressed_sd_m_s, "spots": pressed.spots},
     }
 
 

@@ -18,6 +18,7 @@ from CranioNavLib.sequence_metafile import Recording, read_recording
 from CranioNavLib.slicer_files import LabelledPoints
 from CranioNavLib.volume import Volume
 from ModuleUltrasoundLib.measure import LineMeasurements, bone_points, measure_lines
+from ModuleUltrasoundLib.speed_of_sound import SpeedEstimate, estimate_if_pressed
 
 from ModuleRegistrationLib.anatomy.ct_reader import read_ct
 from ModuleRegistrationLib.anatomy.segmentation import BoneSurfaces, segment_bone
@@ -51,6 +52,7 @@ class Ultrasound:
 
     recording: Recording
     measurements: LineMeasurements
+    pressed: Optional[SpeedEstimate] = None  # speed of sound from pressing on the same spot; None: nobody did
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +198,7 @@ def collect_points(case: Case, mode: str) -> tuple[BonePoints, Optional[Ultrasou
         why = ", ".join(f"{count} times {reason}" for reason, count in most)
         lost = "".join(f", {count} frames {status}" for status, count in statuses)
         raise InputError(f"{case.palpation}: none of {len(recording)} lines shows bone ({why}{lost}); palpate again")
-    return points, Ultrasound(recording, measurements)
+    return points, Ultrasound(recording, measurements, estimate_if_pressed(recording, measurements))
 
 
 def _method_for(mode: str, wanted: Optional[str]) -> str:

@@ -73,6 +73,9 @@ def test_a_registered_case_leaves_record_transform_scene_and_report(a_case, tmp_
     rows = dict(zip(*scene_data.get_table("Results").values()))
     assert "expected (p = " in rows[quantities.HELD_OUT]
     assert len(scene_data.get_bone_points()) >= 12
+    told = record["verification"]["speed_of_sound"]
+    assert told["with_the_registration"]["m_s"] == record["speed_of_sound_m_s"]
+    assert told["by_pressing"] is None  # this hand never varies its pressure on a point
     node = host.scene().GetFirstNodeByName("SurfacePoints")
     assert node.GetParentTransformNode().GetName() == "ReferenceToRas"
     page = (tmp_path / "out" / "report.html").read_text()
