@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Optional
 
 import numpy as np
 from CranioNavLib.errors import InputError
@@ -10,12 +11,12 @@ from CranioNavLib.parameters import Parameters
 from CranioNavLib.rigid import Array
 
 from ModuleRegistrationLib.registration.closest_fit import signed_distances
-from ModuleRegistrationLib.registration.landmarks import register_landmarks
+from ModuleRegistrationLib.registration.landmarks import fit_anisotropic, register_landmarks
 from ModuleRegistrationLib.registration.problem import RegistrationProblem, RegistrationResult, SurfaceRegistration
 
 
 class Procrustes(SurfaceRegistration):
-    """Modes Ia, Ib and IIa of the chapter, equations (3)-(11)."""
+    """Modes Ia, Ib and IIa of the chapter, equations (3)-(11); weighted where the pairs' covariances are known."""
 
     name = "procrustes"
     title = "Paired landmarks or markers only, orthogonal Procrustes"
@@ -36,20 +37,27 @@ class Procrustes(SurfaceRegistration):
             raise InputError("method procrustes needs landmark pairs and got none; add landmarks or choose another method")
         expected = None if problem.landmark_sd_mm is None else problem.landmark_sd_mm * float(np.sqrt(3.0))
         fit = register_landmarks(problem.landmarks_patient_mm, problem.landmarks_ct_mm, expected_fle_mm=expected)
+        pose, covariance = fit.reference_to_ras, fit.covariance
+        freedom: Optional[float] = fit.degrees_of_freedom
+        if problem.landmark_covariances_mm2 is not None:  # then their size is known, too, and not read off the residuals
+            pose, covariance = fit_anisotropic(
+                problem.landmarks_patient_mm, problem.landmarks_ct_mm, problem.landmark_covariances_mm2
+            )
+            freedom = None
         points: Array = np.empty((0, 3))
         residuals: Array = np.empty(0)
         if len(problem.points):
-            points, residuals, _ = signed_distances(problem, fit.reference_to_ras)
+            points, residuals, _ = signed_distances(problem, pose)
         return RegistrationResult(
             method=self.name,
-            reference_to_ras=fit.reference_to_ras,
+            reference_to_ras=pose,
             surface_rms_mm=float(np.sqrt(np.mean(residuals**2))) if len(residuals) else float("nan"),
             residuals_mm=residuals,
             used=np.zeros(len(residuals), dtype=bool),
             iterations=1,
-            stop_reason="closed form",
+            stop_reason="closed form" if problem.landmark_covariances_mm2 is None else "each pair weighed by its own covariance",
             points_ras_mm=points,
-            covariance=fit.covariance,
+            covariance=covariance,
             pivot_ras_mm=fit.pivot_ras_mm,
-            degrees_of_freedom=fit.degrees_of_freedom,
+            degrees_of_freedom=freedom,
         )

@@ -36,11 +36,6 @@ class LandmarkRegistration:
     labels: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()  # what looks wrong but was not refused
 
-    @property
-    def fle_axis_mm(self) -> float:
-        """SD of the fiducial localisation error per axis."""
-        return self.fle_mm / float(np.sqrt(3.0))
-
 
 def fit_rigid(patient_mm: npt.ArrayLike, ct_mm: npt.ArrayLike, weights: Optional[npt.ArrayLike] = None) -> Array:
     """The rigid transform(s) with the least (weighted) sum of squared distances, patient to CT.

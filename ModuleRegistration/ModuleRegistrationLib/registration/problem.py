@@ -24,6 +24,7 @@ class RegistrationProblem:
     landmarks_ct_mm: Array = field(default_factory=lambda: np.empty((0, 3)))  # (L, 3) RAS, paired with:
     landmarks_patient_mm: Array = field(default_factory=lambda: np.empty((0, 3)))  # (L, 3) Reference
     landmark_sd_mm: Optional[float] = None  # FLE per axis of the pairs; None: to be estimated or assumed by the method
+    landmark_covariances_mm2: Optional[Array] = None  # (L, 3, 3) of landmarks_patient_mm, Reference axes, where each is known
     surface_sd_mm: float = 0.3  # how far the segmented surface is from the bone, common offset (threshold bias) left out
     surface_offset_sd_mm: float = 0.5  # prior SD of the segmentation's common offset along the normal
     seed: int = 0  # for methods that draw random starts

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from CranioNavLib.errors import InputError
-from CranioNavLib.rigid import invert_rigid
+from CranioNavLib.rigid import invert_rigid, transform_points
 from ModuleRegistrationLib.registration.problem import METHODS
 
 SURFACE_METHODS = ["icp", "random-icp", "trimmed-icp", "open3d", "cranionav"]
@@ -63,6 +63,21 @@ def test_procrustes_without_landmarks_is_refused(a_case) -> None:
     problem = replace(a_case(0).problem, landmarks_ct_mm=np.empty((0, 3)), landmarks_patient_mm=np.empty((0, 3)))
     with pytest.raises(InputError, match="needs landmark pairs"):
         METHODS.create("procrustes").register(problem)
+
+
+def test_procrustes_weighs_each_pair_by_its_own_covariance(a_case) -> None:
+    case = a_case(0)
+    planned = case.problem.landmarks_ct_mm
+    touched = transform_points(invert_rigid(case.true_reference_to_ras), planned)
+    along_view = np.tile(1e-2 * np.eye(3), (len(planned), 1, 1))
+    along_view[0] = np.diag([1e-2, 1e-2, 100.0])  # seen at a flat angle: its depth is poor
+    touched[0, 2] += 3.0
+    plain = replace(case.problem, landmarks_patient_mm=touched)
+    weighed = METHODS.create("procrustes").register(replace(plain, landmark_covariances_mm2=along_view))
+    equal = METHODS.create("procrustes").register(plain)
+    assert case.tre(weighed.reference_to_ras).max() < 0.05
+    assert case.tre(equal.reference_to_ras).max() > 0.5
+    assert weighed.covariance is not None
 
 
 def test_features_of_a_sweep_that_has_nothing_of_a_skull_are_refused(a_case) -> None:
