@@ -17,6 +17,7 @@ from ModuleUltrasoundLib.signal_forerun import MULTIPLES, Forerun
 
 FAR_MM = 12.0  # stands for "there is none" in distances between echoes
 FAR_DB = 40.0
+CLEAR_DB = 34.0  # over the noise: an echo that is clearer still is no other kind of echo
 MULTIPLE_EARLY_CYCLES = 1.6  # a multiple carries the pulse's delay once, its prediction from the first echo twice
 MULTIPLE_TOLERANCE_S = 2e-7
 REPEATED = 0.5  # of the likeness of a place to that of a multiple: beyond, an echo there is not compared with others
@@ -61,13 +62,14 @@ def line_features(
     stretches = np.stack([candidates.before_db, candidates.after_db, candidates.before_all_db, candidates.after_all_db])
     levels = np.clip(np.nan_to_num(stretches, nan=0.0), -5, 60)
     strongest = np.where(real, snr, np.float32(-FAR_DB)).max(axis=1, keepdims=True, initial=-FAR_DB)
+    clear = np.minimum(snr, CLEAR_DB)
     features = [
-        snr / 20, candidates.saliences_db / 10, levels[0] / 10, levels[1] / 10, levels[2] / 10, levels[3] / 10,
+        clear / 20, candidates.saliences_db / 10, levels[0] / 10, levels[1] / 10, levels[2] / 10, levels[3] / 10,
         (levels[0] - levels[1]) / 10, (levels[2] - levels[3]) / 10, best_before / 15, far_before / 5,
         best_behind / 15, far_behind / 5, depth / 8, depth * megahertz / 50, multiple, share / 15, over_forerun / 30,
         np.broadcast_to(seen, snr.shape).astype(float), reverberation / 15, candidates.widths_s * transducer_hz,
         (before & (pair > -8)).sum(axis=2) / 3.0, (behind & (pair > -8)).sum(axis=2) / 3.0,
-        np.broadcast_to(strongest, snr.shape) / 20, (strongest - snr) / 15,
+        np.broadcast_to(np.minimum(strongest, CLEAR_DB), snr.shape) / 20, (strongest - snr) / 15,
         frequency * 5, lower[0] * 5, lower[1] * 5, candidates.rise_db / 15, candidates.fall_db / 15,
         candidates.end_db / 15, own / 15,
     ]  # fmt: skip

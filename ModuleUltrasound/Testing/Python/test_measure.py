@@ -233,3 +233,13 @@ def test_quality_is_mapped_by_the_likelihood_that_is_given():
     straight = replace(learnt(), quality=(np.array([0.0, 1.0]), np.array([0.0, 1.0])))
     one, other = (measure_lines(recording, likelihood=likelihood).qualities for likelihood in (halved, straight))
     assert one == pytest.approx(other / 2)
+
+
+@pytest.mark.parametrize("snr_db", [25.0, 45.0, 60.0])
+def test_lone_clear_echo_is_taken_in_most_lines_however_quiet_they_are(snr_db):
+    rng = np.random.default_rng(14)
+    time = np.arange(1500) / 50e6 - 2e-3 * 6.0 / SPEED
+    lines = 8000 * (pulse(time, 5e6) + rng.normal(0, 10 ** (-snr_db / 20), (30, len(time))))
+    recording = record(rng, np.full(30, 6.0), Acquisition(50e6, 5e6), samples=1500, points=np.zeros(30, dtype=int))
+    measured = measure_lines(replace(recording, lines=lines.astype(np.int16)), EchoSettings(speed_of_sound_m_s=SPEED))
+    assert measured.accepted.mean() > 0.75
