@@ -174,9 +174,11 @@ def test_whatever_comes_a_taken_point_was_stable_and_good(seed):
     for k in range(300):
         place = place + rng.normal(size=3) * rng.choice([0.02, 1.0, 20.0], p=[0.9, 0.08, 0.02])
         lines[k] = a_line(k * 0.05, place, rng.choice([0.95, 0.2], p=[0.95, 0.05]), bool(rng.random() < 0.97), "no echo", k)
-        point = palpation.add(lines[k]).new_point
-        if point:
-            dwell = [line for j, line in lines.items() if k - 10 <= j <= k and line.accepted and line.quality > 0.85]
+        status = palpation.add(lines[k])
+        if status.reason:  # weak, or too near to a point taken before
+            del lines[k]
+        if point := status.new_point:
+            dwell = [line for j, line in lines.items() if k - 10 <= j <= k]
             assert len(dwell) <= point.lines
             assert np.ptp([line.position_mm for line in dwell], axis=0).max() <= 2 * palpation.settings.stable_mm
             assert point.line.accepted
