@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from CranioNavLib.panel import Step
+from trame.ui.html import DivLayout
 from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import client, html
 from trame.widgets import vuetify3 as v3
@@ -47,7 +48,10 @@ html { overflow: hidden; }
 
 
 class Page:
-    """Builds the page once; everything that changes later is in the shared state."""
+    """Builds the page once; everything that changes later is in the shared state.
+
+    The list of steps and each step are templates of their own: the browser makes only what is open, and draws anew only that.
+    """
 
     def __init__(self, server: Any, panels: dict[str, PanelView], layouts: Any, procedure: tuple[ProcedureStep, ...]) -> None:
         self.server, self.panels = server, panels
@@ -55,12 +59,16 @@ class Page:
         server.state.speaks = ""  # the panel whose message is shown
         server.state.typed = ""  # the part in whose field something is being typed that has not been sent yet
         server.state.trame__title = words.TITLE
+        self._draw_steps(procedure)
+        for number in range(1, len(procedure) + 1):
+            self._draw_step(number, procedure)
         with VAppLayout(server) as self.layout:
             self.layout.root.theme = "dark"
             client.Style(STYLE + DRAWINGS_STYLE + FRAME_STYLE)
             self._draw_title(procedure)
-            self._draw_steps(procedure)
-            self._draw_open_step(procedure)
+            for width, name in ((230, "'steps'"), (350, "'step_' + step")):
+                with v3.VNavigationDrawer(permanent=True, width=width), html.Div():
+                    client.ServerTemplate(name=(name,))
             with v3.VMain(style="height: 100vh;"), html.Div(classes="views"):
                 layouts.initialize_layout_grid(self.layout)
 
@@ -76,7 +84,7 @@ class Page:
             draw_help(procedure, self.panels)
 
     def _draw_steps(self, procedure: tuple[ProcedureStep, ...]) -> None:
-        with v3.VNavigationDrawer(permanent=True, width=230), v3.VList(nav=True, density="comfortable"):
+        with DivLayout(self.server, "steps"), v3.VList(nav=True, density="comfortable"):
             for number, step in enumerate(procedure, start=1):
                 state = self._state_of(step)
                 with (
@@ -96,23 +104,24 @@ class Page:
                         title=(state,),
                     )
 
-    def _draw_open_step(self, procedure: tuple[ProcedureStep, ...]) -> None:
-        with v3.VNavigationDrawer(permanent=True, width=350):
-            for number, step in enumerate(procedure, start=1):
-                after = procedure[number] if number < len(procedure) else None
-                with html.Div(v_show=f"step === '{step.name}'", classes="pa-4", raw_attrs=[f'data-panel="{step.name}"']):
-                    html.Div(f"{number}  {step.title}", classes="text-h6")
-                    with html.Div(classes="in-sight headline"):
-                        self._draw_what_next(step, procedure[: number - 1], after)
-                        draw_live(step.name)
-                    for module, name in step.parts:
-                        view = self.panels[module]
-                        shown = f"{view.key}.status['{name}'].state !== 'done'" if name == "resume" else "true"
-                        only_simulated = module == HAND and name != "patient"
-                        with html.Div(classes="part", v_show="simulated" if only_simulated else shown):
-                            view.draw(self._part(module, name))
-                    if step.name == "report":
-                        self._draw_files()
+    def _draw_step(self, number: int, procedure: tuple[ProcedureStep, ...]) -> None:
+        step, after = procedure[number - 1], procedure[number] if number < len(procedure) else None
+        with (
+            DivLayout(self.server, f"step_{step.name}"),
+            html.Div(classes="pa-4", raw_attrs=[f'data-panel="{step.name}"']),
+        ):
+            html.Div(f"{number}  {step.title}", classes="text-h6")
+            with html.Div(classes="in-sight headline"):
+                self._draw_what_next(step, procedure[: number - 1], after)
+                draw_live(step.name)
+            for module, name in step.parts:
+                view = self.panels[module]
+                shown = f"{view.key}.status['{name}'].state !== 'done'" if name == "resume" else "true"
+                only_simulated = module == HAND and name != "patient"
+                with html.Div(classes="part", v_show="simulated" if only_simulated else shown):
+                    view.draw(self._part(module, name))
+            if step.name == "report":
+                self._draw_files()
 
     def _draw_what_next(self, step: ProcedureStep, before: tuple[ProcedureStep, ...], after: ProcedureStep | None) -> None:
         """What to do now with the one button for it, what was said of it, and the way on, which is never locked."""
