@@ -7,8 +7,8 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import scipy
 from CranioNavLib.rigid import Array
-from scipy.spatial.transform import Rotation
 
 from ModuleTrackingLib.tracker import PoseStatus, ToolPose
 
@@ -99,8 +99,11 @@ def interpolate(a: Array, b: Array, share: float) -> Array:
     sines = np.array((turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])) / 2  # axis times sin(angle)
     sine, cosine = math.sqrt(float(sines @ sines)), (float(turn.trace()) - 1) / 2
     if cosine < 0.5:  # far apart: rare, and the axis needs more care
-        start = Rotation.from_matrix(a[:3, :3])
-        rotation = (start * Rotation.from_rotvec(share * Rotation.from_matrix(turn).as_rotvec())).as_matrix()
+        start = scipy.spatial.transform.Rotation.from_matrix(a[:3, :3])
+        rotation = (
+            start
+            * scipy.spatial.transform.Rotation.from_rotvec(share * scipy.spatial.transform.Rotation.from_matrix(turn).as_rotvec())
+        ).as_matrix()
     else:
         part = share * math.atan2(sine, cosine)
         x, y, z = sines / max(sine, 1e-300)

@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from CranioNavLib.rigid import Array
-from scipy.ndimage import gaussian_filter1d
 
 from ModuleUltrasoundLib.echo_candidates import DECIBEL, Candidates
 from ModuleUltrasoundLib.echo_network import Likelihood, probabilities
@@ -211,7 +211,7 @@ class DepthMap:
 def _blur(size: int, same_mm: float) -> npt.NDArray[np.float32]:
     """Matrix (M, M) that spreads a weight by a Gaussian of height 1, cut off at two standard deviations."""
     sigma = same_mm / BIN_MM
-    kernel = gaussian_filter1d(np.eye(size), sigma, axis=1, mode="constant", truncate=2.0)
+    kernel = scipy.ndimage.gaussian_filter1d(np.eye(size), sigma, axis=1, mode="constant", truncate=2.0)
     return np.asarray(kernel * (np.sqrt(2 * np.pi) * sigma), dtype=np.float32)
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Recording
-from scipy.special import erf
 
 Bools = npt.NDArray[np.bool_]
 
@@ -41,7 +41,7 @@ def quality_of(depth_mm: Array, best: npt.NDArray[np.int64], chance: Array, dept
     """
     chosen = depth_mm[np.arange(len(best)), best]
     same = np.abs(depth_mm - chosen[:, None]) < TOLERANCE_MM
-    timed = erf(TOLERANCE_MM / np.sqrt(2) / np.maximum(np.nan_to_num(depth_sd_mm, nan=1.0), 1e-6))
+    timed = scipy.special.erf(TOLERANCE_MM / np.sqrt(2) / np.maximum(np.nan_to_num(depth_sd_mm, nan=1.0), 1e-6))
     return np.where(np.isfinite(chosen), np.where(same, chance, 0.0).sum(axis=1) * timed, 0.0)
 
 

@@ -11,9 +11,9 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from CranioNavLib.errors import InputError
 from CranioNavLib.sequence_metafile import Acquisition
-from scipy import fft
 
 Floats = npt.NDArray[np.float32]
 
@@ -81,7 +81,7 @@ def design_band(acquisition: Acquisition, samples: int, until_s: float) -> Band:
     """The band-pass for lines of `samples` samples of which the part before `until_s` is wanted."""
     sampling, centre = acquisition.sampling_hz, acquisition.transducer_hz
     length = min(samples, int(np.ceil(until_s * sampling)))
-    padded = int(fft.next_fast_len(length + int(3 * sampling / centre), real=True))
+    padded = int(scipy.fft.next_fast_len(length + int(3 * sampling / centre), real=True))
     step = sampling / padded
     first = max(1, int(np.ceil(BAND_EDGES[0] * centre / step)))
     last = min(padded // 2, int(BAND_EDGES[1] * centre / step))
@@ -89,7 +89,7 @@ def design_band(acquisition: Acquisition, samples: int, until_s: float) -> Band:
     sigma = BAND_WIDTH * centre / 2.3548
     gain = np.exp(-0.5 * ((frequencies - BAND_CENTRE * centre) / sigma) ** 2)
     middle = round(BAND_CENTRE * centre / step)
-    out_length = int(fft.next_fast_len(max(int(np.ceil(OVERSAMPLING * centre / step)), last - first)))
+    out_length = int(scipy.fft.next_fast_len(max(int(np.ceil(OVERSAMPLING * centre / step)), last - first)))
     return Band(
         length=length,
         padded=padded,
@@ -119,11 +119,11 @@ def complex_envelopes(lines: npt.NDArray[np.int16], band: Band) -> Envelopes:
         rf[:] = some
         remove_drift(rf)
         rf[:, band.length - len(band.fade) :] *= band.fade
-        spectrum = fft.rfft(whole[: len(some)], axis=1)[:, band.first : band.first + size]
+        spectrum = scipy.fft.rfft(whole[: len(some)], axis=1)[:, band.first : band.first + size]
         turned = shifted[: len(some)]
         np.multiply(spectrum[:, below:], gain[below:], out=turned[:, : size - below])
         np.multiply(spectrum[:, :below], gain[:below], out=turned[:, band.out_length - below :])
-        values[start : start + BLOCK] = fft.ifft(turned, axis=1)[:, :keep]
+        values[start : start + BLOCK] = scipy.fft.ifft(turned, axis=1)[:, :keep]
     return Envelopes(values=values, rate_hz=band.rate_hz, carrier_hz=band.carrier_hz)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
+import scipy  # by its own name: its parts load when they are first used, after the start
 
 from CranioNavLib.errors import InputError
 
@@ -102,7 +102,7 @@ def rigid(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Array:
 
 def rigid_from_vector(rotation_vector: npt.ArrayLike, translation: npt.ArrayLike, pivot: npt.ArrayLike = (0, 0, 0)) -> Array:
     """Transform(s) that rotate about `pivot` (mm) by a rotation vector (rad), then translate (mm). Batched."""
-    turn = Rotation.from_rotvec(np.asarray(rotation_vector, dtype=float)).as_matrix()
+    turn = scipy.spatial.transform.Rotation.from_rotvec(np.asarray(rotation_vector, dtype=float)).as_matrix()
     pivot = np.asarray(pivot, dtype=float)
     return rigid(turn, np.asarray(translation, dtype=float) + pivot - np.einsum("...ij,...j->...i", turn, pivot))
 
@@ -143,4 +143,4 @@ def rotate_covariances(matrix: npt.ArrayLike, covariances: npt.ArrayLike) -> Arr
 def rotation_angle_deg(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
     """Angle between the rotations of two transforms."""
     turn: Any = np.asarray(a, dtype=float)[:3, :3].T @ np.asarray(b, dtype=float)[:3, :3]
-    return float(np.degrees(Rotation.from_matrix(turn).magnitude()))
+    return float(np.degrees(scipy.spatial.transform.Rotation.from_matrix(turn).magnitude()))

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from CranioNavLib.rigid import Array, invert_rigid, rigid_from_vector
-from scipy.spatial.transform import Rotation
-from scipy.special import betaln, logsumexp
 
 from ModuleRegistrationLib.registration.landmarks import motion_jacobian
 from ModuleRegistrationLib.registration.likelihood import OUTLIER_PRIOR, PARAMETERS, Model, State, evaluate
@@ -42,7 +41,11 @@ class Posterior:
 
 def motion_vector(motion: Array, pivot: Array) -> Array:
     """(..., 6) rotation vector about the pivot and translation of motions (..., 4, 4); inverse of rigid_from_vector."""
-    turn = Rotation.from_matrix(motion[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*motion.shape[:-2], 3)
+    turn = (
+        scipy.spatial.transform.Rotation.from_matrix(motion[..., :3, :3].reshape(-1, 3, 3))
+        .as_rotvec()
+        .reshape(*motion.shape[:-2], 3)
+    )
     shift = motion[..., :3, 3] + motion[..., :3, :3] @ pivot - pivot
     return np.concatenate([turn, shift], axis=-1)
 
@@ -79,7 +82,7 @@ def sample_posterior(
     )
     proposal = np.stack([_log_density(model, minima, roots, k, state) + np.log(share[k]) for k in range(len(share))])
     cost = evaluate(model, state).cost
-    log_weight = -cost - logsumexp(proposal, axis=0)
+    log_weight = -cost - scipy.special.logsumexp(proposal, axis=0)
     weight = np.exp(log_weight - log_weight.max())
     weight = np.minimum(weight, weight.mean() * np.sqrt(count))  # truncated: one lucky sample decides nothing
     weight = weight / weight.sum()
@@ -101,7 +104,7 @@ def _log_density(model: Model, minima: State, roots: Array, k: int, state: State
     narrow = np.log(np.diagonal(roots[k])).sum()
     scale = np.log(state.scale / minima.scale[k]) / LOG_SCALE_SD
     bad, good = (exponents[k] for exponents in _outlier_law(model, minima))
-    share = (bad - 1) * np.log(state.outliers) + (good - 1) * np.log1p(-state.outliers) - betaln(bad, good)
+    share = (bad - 1) * np.log(state.outliers) + (good - 1) * np.log1p(-state.outliers) - scipy.special.betaln(bad, good)
     distance = (PROPOSAL_FREEDOM + size) / 2 * np.log1p((white**2).sum(axis=0) / PROPOSAL_FREEDOM)
     density: Array = share - distance - narrow - scale**2 / 2
     return density

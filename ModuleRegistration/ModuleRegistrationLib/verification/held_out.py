@@ -13,9 +13,9 @@ from typing import Optional
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array
-from scipy import special
 
 from ModuleRegistrationLib.registration.landmarks import motion_jacobian
 from ModuleRegistrationLib.registration.problem import RegistrationProblem, RegistrationResult, SurfaceRegistration
@@ -138,7 +138,7 @@ def check_held_out(
         expected_sd_mm=sds[used],
         chi_square=chi_square,
         degrees_of_freedom=freedom,
-        p_value=float(special.chdtrc(freedom, chi_square)),
+        p_value=float(scipy.special.chdtrc(freedom, chi_square)),
     )
 
 

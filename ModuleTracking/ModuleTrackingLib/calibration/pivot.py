@@ -8,10 +8,10 @@ from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from CranioNavLib.errors import InputError
 from CranioNavLib.parameters import Limits, Parameters
 from CranioNavLib.rigid import Array, check_rigid
-from scipy.special import gammainc
 
 FEWEST_POSES = 20
 SAMPLE = 8  # poses of one random trial: enough tilt among them, and free of slips in 43 % of trials at 10 % slips
@@ -221,8 +221,8 @@ def _without_slips(poses: Array, rng: np.random.Generator, trials: int) -> npt.N
         if np.array_equal(again, used):
             break
         used = again
-    beyond = 1 - gammainc(1.5, SLIP_SDS**2 / 2)  # of normal misses
-    by_chance = gammainc(float((~used).sum()), len(poses) * beyond)  # Poisson's P(that many or more)
+    beyond = 1 - scipy.special.gammainc(1.5, SLIP_SDS**2 / 2)  # of normal misses
+    by_chance = scipy.special.gammainc(float((~used).sum()), len(poses) * beyond)  # Poisson's P(that many or more)
     if by_chance > 1e-3 and misses.max() <= CERTAIN_SDS:
         used = np.ones(len(poses), dtype=bool)
     return used

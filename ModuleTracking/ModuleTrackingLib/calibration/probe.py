@@ -7,10 +7,10 @@ from typing import Annotated, Optional, Union
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from CranioNavLib.errors import InputError
 from CranioNavLib.parameters import Limits, Parameters
 from CranioNavLib.rigid import Array, check_rigid
-from scipy.optimize import least_squares
 
 from ModuleTrackingLib.calibration.spin import tool_to_marker
 
@@ -214,8 +214,8 @@ class _Problem:
             return np.concatenate([np.concatenate(rows)[keep[echo]], *priors])
 
         # The problem is almost linear: plain least squares leads near from any start, and the robust loss from there.
-        parameters = least_squares(residuals, parameters, x_scale="jac").x
-        parameters = least_squares(residuals, parameters, loss="soft_l1", x_scale="jac", max_nfev=200).x
+        parameters = scipy.optimize.least_squares(residuals, parameters, x_scale="jac").x
+        parameters = scipy.optimize.least_squares(residuals, parameters, loss="soft_l1", x_scale="jac", max_nfev=200).x
         for _ in range(20):
             lengths = np.sqrt(np.bincount(echo, np.concatenate(self.misses(parameters)[0]) ** 2, self.echoes))
             scale = max(MAD * float(np.median(lengths[keep])) / 1.2, 1.0)  # at least the stated errors
@@ -225,8 +225,8 @@ class _Problem:
             keep = again
             if keep.sum() < FEWEST_ECHOES:
                 break
-            parameters = least_squares(residuals, parameters, x_scale="jac").x
-        return np.asarray(least_squares(residuals, parameters, x_scale="jac").x), keep
+            parameters = scipy.optimize.least_squares(residuals, parameters, x_scale="jac").x
+        return np.asarray(scipy.optimize.least_squares(residuals, parameters, x_scale="jac").x), keep
 
     def result(self, parameters: Array, keep: npt.NDArray[np.bool_]) -> ProbeCalibration:
         echo = np.concatenate(self.echo_of_row)
@@ -235,7 +235,7 @@ class _Problem:
             rows, priors = self.misses(x)
             return np.concatenate([np.concatenate(rows)[keep[echo]], *priors])
 
-        fit = least_squares(residuals, parameters, x_scale="jac", max_nfev=1)
+        fit = scipy.optimize.least_squares(residuals, parameters, x_scale="jac", max_nfev=1)
         singular = np.linalg.svd(fit.jac / np.linalg.norm(fit.jac, axis=0), compute_uv=False)
         if not np.isfinite(singular).all() or singular[-1] < 1e-6:
             raise InputError(f"the echoes do not settle the probe; {WHAT_TO_VARY}")

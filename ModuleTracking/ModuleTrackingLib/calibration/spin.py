@@ -7,9 +7,9 @@ from typing import Optional
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array, rigid
-from scipy.spatial.transform import Rotation
 
 from ModuleTrackingLib.calibration.pivot import FEWEST_POSES, _checked
 
@@ -86,7 +86,7 @@ def _axis(poses: Array) -> tuple[Array, Array]:
 
 def _turned_deg(poses: Array, axis: Array) -> float:
     """Angle between the two farthest neighbours' complement: how much of the circle was covered."""
-    relative = Rotation.from_matrix(poses[0, :3, :3].T @ poses[:, :3, :3]).as_quat()
+    relative = scipy.spatial.transform.Rotation.from_matrix(poses[0, :3, :3].T @ poses[:, :3, :3]).as_quat()
     angles = np.sort(np.degrees(2 * np.arctan2(relative[:, :3] @ axis, relative[:, 3])) % 360)
     gaps = np.diff(np.append(angles, angles[0] + 360))
     return float(360 - gaps.max())

@@ -7,7 +7,7 @@ from typing import Optional
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
+import scipy
 
 from CranioNavLib.phantom import constants
 from CranioNavLib.phantom.beam import look_at_bone
@@ -46,7 +46,7 @@ def frames_along(beams: npt.ArrayLike, origins_mm: npt.ArrayLike, roll_rad: Opti
     frames = rigid(np.stack([x, np.cross(z, x), z], axis=2), np.asarray(origins_mm, dtype=float))
     if roll_rad is None:
         return frames
-    turn = Rotation.from_rotvec(np.column_stack([np.zeros((len(z), 2)), roll_rad])).as_matrix()
+    turn = scipy.spatial.transform.Rotation.from_rotvec(np.column_stack([np.zeros((len(z), 2)), roll_rad])).as_matrix()
     rolled: Array = frames @ rigid(turn, np.zeros(3))
     return rolled
 
@@ -86,7 +86,7 @@ def stand_at(
         points[lost], normals[lost] = fallback[0][lost], fallback[1][lost]
     tilts = np.radians(rng.normal(0.0, skill.tilt_sd_deg, (len(positions), 2)))
     tilted = frames_along(-normals, points) @ rigid(
-        Rotation.from_rotvec(np.column_stack([tilts, np.zeros(len(tilts))])).as_matrix(), np.zeros(3)
+        scipy.spatial.transform.Rotation.from_rotvec(np.column_stack([tilts, np.zeros(len(tilts))])).as_matrix(), np.zeros(3)
     )
     beams = tilted[:, :3, 2]
     return Stand(points, beams, pressed_tissue(patient, points, beams, rng.uniform(*constants.COMPRESSION_RANGE, len(beams))))
@@ -123,7 +123,7 @@ def slide_over(
     points = np.where(np.isfinite(points), points, chord)  # over a hole the hand goes on
     sway = tremor(rng, 1, lines, 3)[0]
     tilts = np.column_stack([np.radians(tilt_sd_deg) * sway[:, :2], np.zeros(lines)])
-    frames = frames_along(-upright, points) @ rigid(Rotation.from_rotvec(tilts).as_matrix(), np.zeros(3))
+    frames = frames_along(-upright, points) @ rigid(scipy.spatial.transform.Rotation.from_rotvec(tilts).as_matrix(), np.zeros(3))
     low, high = constants.COMPRESSION_RANGE
     tissue = pressed_tissue(patient, points, frames[:, :3, 2], low + (high - low) * ndtr(sway[:, 2]))
     depth = np.zeros((lines, 3))
@@ -142,7 +142,9 @@ def hold(stand: Stand, lines: int, rng: np.random.Generator, skill: Optional[Ski
     tilt = np.radians(skill.tremor_tilt_sd_deg) * tremor(rng, count, lines, 2)
     slide = skill.tremor_position_sd_mm * tremor(rng, count, lines, 3)
     slide[..., 2] *= 0.3  # the skin is pressed, and holds the probe along the beam better than across
-    turn = Rotation.from_rotvec(np.concatenate([tilt, np.zeros((count, lines, 1))], axis=2).reshape(-1, 3)).as_matrix()
+    turn = scipy.spatial.transform.Rotation.from_rotvec(
+        np.concatenate([tilt, np.zeros((count, lines, 1))], axis=2).reshape(-1, 3)
+    ).as_matrix()
     moves = rigid(turn.reshape(count, lines, 3, 3), slide)
     back = rigid(np.eye(3), np.array([0.0, 0.0, -constants.FORERUN_LENGTH_MM]))  # contact -> transducer's face
     poses: Array = base[:, None] @ moves @ back

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+import scipy
 
 from CranioNavLib.phantom import constants
 from CranioNavLib.rigid import Array, rigid
@@ -57,7 +57,9 @@ class Path:
         smooth = share**3 * (10 - 15 * share + 6 * share**2)
         if smooth >= 1.0:
             return self.goal
-        turn = Slerp([0.0, 1.0], Rotation.from_matrix([self.start[:3, :3], self.goal[:3, :3]]))(smooth).as_matrix()
+        turn = scipy.spatial.transform.Slerp(
+            [0.0, 1.0], scipy.spatial.transform.Rotation.from_matrix([self.start[:3, :3], self.goal[:3, :3]])
+        )(smooth).as_matrix()
         place = (1 - smooth) * self.start[:3, 3] + smooth * self.goal[:3, 3] + np.sin(np.pi * smooth) * self.lift
         return rigid(turn, place)
 

@@ -8,7 +8,7 @@ from typing import Optional
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
+import scipy
 
 from CranioNavLib.errors import InputError
 from CranioNavLib.phantom import constants
@@ -141,7 +141,7 @@ def make_patient(
     distance = rng.uniform(*constants.REFERENCE_BASE_DISTANCE_MM)
     direction = rng.normal(size=3)
     base_to_ras = rigid(
-        Rotation.random(random_state=rng).as_matrix(),
+        scipy.spatial.transform.Rotation.random(random_state=rng).as_matrix(),
         scanned.head.skin.center_mm + distance * direction / np.linalg.norm(direction),
     )
     return VirtualPatient(
@@ -149,7 +149,7 @@ def make_patient(
         seed=seed,
         true_reference_to_ras=base_to_ras,
         tissue=Tissue.draw(rng, drawn_for),
-        tracker_error=TrackerError(Rotation.random(random_state=rng).as_matrix()),
+        tracker_error=TrackerError(scipy.spatial.transform.Rotation.random(random_state=rng).as_matrix()),
         acquisition=acquisition(),
         probe_calibration_error=rigid_from_vector(
             np.radians(rng.normal(0.0, constants.PROBE_CALIBRATION_SD_DEG, 3)),
