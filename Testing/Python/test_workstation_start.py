@@ -1,7 +1,9 @@
-"""The page is built once, and comes out as it does when it is built many times."""
+"""The start: the page is built once, as it comes out when built many times; what it does not need loads later."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import uuid
 from contextlib import nullcontext
 from typing import Any
@@ -42,3 +44,13 @@ def test_the_page_is_the_same_but_written_fewer_times():
     once, few = page_built_in(built_once())
     assert once.split("<", 2)[2] == often.split("<", 2)[2]
     assert few < many / 2
+
+
+def test_what_the_first_page_does_not_need_is_not_loaded_with_the_modules():
+    later = "scipy.spatial scipy.special scipy.ndimage scipy.optimize scipy.fft SimpleITK open3d matplotlib jinja2".split()
+    code = (
+        "import sys, ModuleRegistration, ModuleTracking, ModuleUltrasound, Workstation.web.simulated_hand; "
+        f"print([name for name in {later!r} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

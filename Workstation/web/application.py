@@ -17,7 +17,7 @@ from CranioNavLib.panel_model import PanelModel
 from trame.app import TrameApp
 from trame_slicer.app.logic import get_view_trame_id
 
-from Workstation.web.background import BackgroundRunner
+from Workstation.web.background import BackgroundRunner, load_soon_needed
 from Workstation.web.built_once import built_once
 from Workstation.web.drawings import drawings
 from Workstation.web.page import Page
@@ -38,6 +38,7 @@ from Workstation.web.views import ViewFollower
 
 POLL_S = 0.03  # views that follow a tool look for a newer pose just before they are painted
 REFRESH_EVERY = 6  # polls between two looks at the read-outs
+AHEAD_S = 1.0  # after the first window has come, whose first pictures go first
 STANDS_S = 0.6  # without a new pose: nothing moves
 SAVE_EVERY = 33  # polls between two looks at what is to be saved
 PICTURE_QUALITY = 90  # JPEG; one quality for moving and still pictures, so that none is sent twice
@@ -83,6 +84,7 @@ class WorkstationApp(TrameApp):
             self.page = Page(self.server, self.panels, self.layouts, PROCEDURE)
         self.server.controller.on_server_ready.add_task(self._keep_fresh)
         self.server.controller.on_server_ready.add_task(self.painter.run)
+        self.server.controller.on_server_ready.add_task(self._load_ahead)
 
     @property
     def ui(self) -> Any:
@@ -150,6 +152,13 @@ class WorkstationApp(TrameApp):
                     part(turn)
                 except Exception:  # a read-out's defect must not end tracking
                     LOG.exception("the page could not be brought up to date")
+
+    async def _load_ahead(self, **_: Any) -> None:
+        """Load what will soon be needed, once a window shows the page."""
+        while not self.server.state.control["window"]:
+            await asyncio.sleep(POLL_S)
+        await asyncio.sleep(AHEAD_S)
+        self.runner.start(load_soon_needed, _raise_if_failed)
 
     def _draw_again(self, area: str) -> None:
         """Send the picture of a view, or of all, to a window that has none yet."""

@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 WORKERS = 3
+SOON_NEEDED = ("scipy.spatial.transform", "scipy.special", "scipy.ndimage", "scipy.optimize", "scipy.fft", "SimpleITK")
+
+
+def load_soon_needed() -> None:
+    """Load what the first steps need and the first page does not. In a worker, where it holds up nobody."""
+    for name in SOON_NEEDED:
+        importlib.import_module(name)
 
 
 class BackgroundRunner:
