@@ -128,6 +128,7 @@ def test_layouts_windows_sounds_and_help_by_keys(tmp_path):
         assert cue.get_attribute("data-played") is None
         page.keyboard.press("n")
         page.locator("[data-panel=bone]").wait_for()
+        assert page.locator("[data-panel]").count() == 1, "more is made than the open step"
         page.keyboard.press("b")
         page.locator("[data-panel=ct]").wait_for()
         assert user.defects == []
