@@ -9,7 +9,7 @@ without end, air or nothing. The ranges are meant to hold any simulator or phant
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -76,6 +76,7 @@ class Bench:
     depth_mm: tuple[float, float]
     misses: float
     most_tilt_deg: float
+    bare: bool = False  # nothing but bone, or nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +155,27 @@ def draw_bench(rng: np.random.Generator) -> Bench:
         depth_mm=depth,
         misses=float(rng.choice([0.0, 0.08, 0.2, 0.45], p=[0.3, 0.3, 0.25, 0.15])),
         most_tilt_deg=float(rng.choice([2.0, 5.0, 8.0], p=[0.3, 0.5, 0.2])),
+    )
+
+
+def draw_bare(rng: np.random.Generator) -> Bench:
+    """A bench in a water bath: bone, sometimes its inner table and a reverberation, noise, and nothing else."""
+    return replace(
+        draw_bench(rng),
+        bare=True,
+        noise="white",
+        bursts=0.0,
+        spikes=0.0,
+        parasites=0,
+        speckle_db=99.0,
+        leak_db=99.0,
+        borders=0,
+        floor_db=99.0,
+        rough_mm=0.0,
+        inner_db=_maybe(rng, 0.5, 5, 26, 99.0),
+        pores_db=99.0,
+        multiple_db=_maybe(rng, 0.3, 5, 30, 99.0),
+        clip=1.0,
     )
 
 
@@ -256,6 +278,8 @@ def draw_path(bench: Bench, rng: np.random.Generator, frames: int) -> Path:
     if bench.way == "glide" and bench.misses:  # the probe leaves the bone for a while
         start, length = rng.integers(0, frames, 2)
         kind = np.where((np.arange(frames) - start) % frames < length * bench.misses, str(rng.choice(MISSES)), "bone")
+    if bench.bare:  # alone, an interface is all that bone is: nothing could tell them apart
+        kind = np.where(kind == "interface", "nothing", kind)
     walk = np.cumsum(rng.normal(0, 0.05, (frames, 3)), axis=0)
     origin = rng.uniform(-70, 70, (count, 3))[place] + walk
     origin[:, 0] += bench.step_mm * np.arange(frames) * (bench.way == "glide")
