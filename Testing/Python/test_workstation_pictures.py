@@ -110,6 +110,21 @@ def test_the_window_is_told_how_old_its_pictures_are_though_none_can_be_painted(
     while_sending(viewer, deeds)
 
 
+def test_a_window_that_closes_while_a_picture_is_on_its_way_is_let_go_quietly():
+    class Closed(Socket):
+        async def send_bytes(self, data: bytes) -> None:
+            raise ConnectionResetError("Cannot write to closing transport")
+
+    pictures, viewer = Pictures(), Viewer(Closed())
+
+    async def deeds() -> None:
+        sending = asyncio.create_task(viewer.send(lambda: ["axial"]))
+        begun(pictures, viewer)
+        await asyncio.wait_for(sending, 2)  # it ends, and with no error
+
+    asyncio.run(deeds())
+
+
 def test_a_picture_is_encoded_the_right_way_up():
     pixels = np.zeros((40, 60, 3), np.uint8)
     pixels[:20] = (255, 0, 0)  # the lower half, as rows go from the bottom up

@@ -74,7 +74,11 @@ class Viewer:
         return now_s - since if since is not None else 0.0
 
     async def send(self, areas: Callable[[], list[str]]) -> None:
-        """Send for ever what there is, and how old it is."""
+        """Send what there is, and how old it is, until the window is gone."""
+        with contextlib.suppress(ConnectionError):  # it closed while something was on its way
+            await self._send(areas)
+
+    async def _send(self, areas: Callable[[], list[str]]) -> None:
         told_s = 0.0
         while True:
             for area in [one for one in self._pending if len(self._sent[one]) < MOST_ON_THEIR_WAY]:
