@@ -217,14 +217,16 @@ def serve(station: Station, line: Line, keep_state: bool = False) -> None:
         Let the device go on when the host closes the line or goes back to 9600 baud. Otherwise both reset
         it, which stands for the break that neither a pseudo-terminal nor a socket carries.
     """
-    with contextlib.suppress(KeyboardInterrupt):
+    with contextlib.suppress(KeyboardInterrupt):  # it came before the handler stood
         _serve(station, line, keep_state, side_channel())
 
 
 def _serve(station: Station, line: Line, keep_state: bool, control: Optional[int]) -> None:
     reset_asked: list[bool] = []
     stop_asked: list[bool] = []
-    signal.signal(signal.SIGTERM, lambda *_: stop_asked.append(True))
+    # an exception instead could be swallowed where Python may not raise one, such as inside an import
+    for name in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(name, lambda *_: stop_asked.append(True))
     if hasattr(signal, "SIGUSR1"):
         signal.signal(signal.SIGUSR1, lambda *_: reset_asked.append(True))
     typed = b""
