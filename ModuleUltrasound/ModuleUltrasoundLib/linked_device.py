@@ -5,14 +5,13 @@ from __future__ import annotations
 import queue
 import time
 from abc import abstractmethod
-from collections import Counter, deque
+from collections import Counter
 from typing import Any, Optional
 
 from ModuleUltrasoundLib.connection import ByteLink, DeviceState, LinkLostError
 from ModuleUltrasoundLib.device import AModeDevice, DeviceError, RfLine
 
 RETRY_S = 1.0  # between two attempts to reach a lost device
-RATE_WINDOW = 20  # lines over which the rate is measured
 
 
 class LinkedDevice(AModeDevice):
@@ -28,7 +27,6 @@ class LinkedDevice(AModeDevice):
         self.counters: Counter[str] = Counter()
         self._link: Optional[ByteLink] = None
         self._retry_at = 0.0
-        self._arrivals: deque[float] = deque(maxlen=RATE_WINDOW)
         self._wanted_gain: queue.Queue[float] = queue.Queue()
 
     @abstractmethod
@@ -54,13 +52,6 @@ class LinkedDevice(AModeDevice):
     def set_gain_db(self, gain_db: float) -> None:
         """Change the gain before the next line. May be called from any thread: `read` applies it."""
         self._wanted_gain.put(float(gain_db))
-
-    @property
-    def lines_per_s(self) -> float:
-        """Rate of the last lines as they arrived; NaN before there are two."""
-        if len(self._arrivals) < 2:
-            return float("nan")
-        return (len(self._arrivals) - 1) / max(self._arrivals[-1] - self._arrivals[0], 1e-9)
 
     @property
     def link(self) -> ByteLink:
@@ -114,8 +105,6 @@ class LinkedDevice(AModeDevice):
             self.counters["lost"] += 1
             self.state, self._retry_at = DeviceState.LOST, time.monotonic() + RETRY_S
             raise
-        if line is not None:
-            self._arrivals.append(time.monotonic())
         return line
 
     def stop(self) -> None:

@@ -17,6 +17,8 @@ from CranioNavLib.recording import Acquisition, Recording
 from CranioNavLib.rigid import rigid_from_vector
 from scipy.signal import fftconvolve
 
+from Testing.Studies.line_truth import Truth
+
 Array = npt.NDArray[np.float64]
 
 PER_CYCLE = 32  # samples of the pulse's table a cycle of the transducer
@@ -77,17 +79,6 @@ class Bench:
     misses: float
     most_tilt_deg: float
     bare: bool = False  # nothing but bone, or nothing
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """What was simulated in each line."""
-
-    depth_mm: Array  # NaN: no bone
-    tilt_deg: Array
-    kind: tuple[str, ...]
-    speed_m_s: float
-    snr_db: Array  # of the bone's echo; -inf without
 
 
 def _maybe(rng: np.random.Generator, share: float, low: float, high: float, otherwise: float) -> float:
@@ -319,7 +310,7 @@ def simulate(rng: np.random.Generator, frames: int, bench: Bench | None = None) 
     snr = np.where(has, 20 * np.log10(np.maximum(own, 1e-12) / noise), -np.inf)
     return (
         recording,
-        Truth(np.where(has, path.depth_mm, np.nan), path.tilt_deg, tuple(path.kind.tolist()), bench.speed_m_s, snr),
+        Truth(np.where(has, path.depth_mm, np.nan), path.tilt_deg, bench.speed_m_s, snr),
         bench,
     )
 

@@ -13,6 +13,8 @@ import numpy.typing as npt
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition, Recording
 
+from Testing.Studies.line_truth import Truth
+
 Array = npt.NDArray[np.float64]
 
 SAMPLING_MHZ = (25.0, 31.25, 40.0, 50.0, 60.0, 62.5, 80.0, 100.0, 125.0)
@@ -70,17 +72,6 @@ class World:
     largest_code: int
     frames_a_point: int
     sweep: bool
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """What was simulated in each line."""
-
-    depth_mm: Array  # NaN: no bone
-    tilt_deg: Array
-    kind: tuple[str, ...]  # bone, tissue, air, noise
-    speed_m_s: float
-    snr_db: Array  # of the bone echo; -inf without
 
 
 def draw_world(rng: np.random.Generator, frames_a_point: int | None = None) -> World:
@@ -241,7 +232,7 @@ def simulate(
         timestamps_s=np.arange(frames) / 50,
         palpation_points=np.full(frames, -1) if world.sweep else repeat.astype(np.int64),
     )
-    truth = Truth(np.where(kind == "bone", depth, np.nan), tilt, tuple(kind.tolist()), world.speed_m_s, snr)
+    truth = Truth(np.where(kind == "bone", depth, np.nan), tilt, world.speed_m_s, snr)
     return recording, truth, world
 
 

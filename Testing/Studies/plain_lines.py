@@ -14,6 +14,8 @@ import numpy.typing as npt
 from CranioNavLib.recording import Acquisition, Recording
 from CranioNavLib.rigid import rigid_from_vector
 
+from Testing.Studies.line_truth import Truth
+
 Array = npt.NDArray[np.float64]
 
 FACE, BACK = 0.3, -0.4  # forerun's echo, and each further one over the one before
@@ -41,16 +43,6 @@ class Plain:
     inner: float  # over bone's echo
     skull_mm: float
     codes: float
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """What was simulated in each line."""
-
-    depth_mm: Array  # NaN: no bone
-    tilt_deg: Array
-    speed_m_s: float
-    snr_db: Array  # of the bone's echo; -inf without
 
 
 def draw_plain(rng: np.random.Generator) -> Plain:

@@ -16,6 +16,8 @@ from CranioNavLib.recording import Acquisition, Recording
 from CranioNavLib.rigid import rigid_from_vector
 from scipy.special import j1
 
+from Testing.Studies.line_truth import Truth
+
 Array = npt.NDArray[np.float64]
 
 NEPER = np.log(10) / 20  # a decibel
@@ -70,17 +72,6 @@ class Setup:
     depth_mm: tuple[float, float]  # of this recording
     miss_share: float
     most_tilt_deg: float
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """What was simulated in each line."""
-
-    depth_mm: Array  # NaN: no bone
-    tilt_deg: Array
-    kind: tuple[str, ...]
-    speed_m_s: float
-    snr_db: Array  # of the bone's echo; -inf without
 
 
 def draw_setup(rng: np.random.Generator) -> Setup:
@@ -389,7 +380,7 @@ def simulate(rng: np.random.Generator, frames: int, setup: Setup | None = None) 
         lines=lines, acquisition=acquisition, probe_to_reference=poses, statuses=("OK",) * frames,
         timestamps_s=np.arange(frames) / 40, palpation_points=np.full(frames, -1),
     )  # fmt: skip
-    return recording, Truth(depth, tilt, tuple(kinds), setup.speed_m_s, np.where(np.isfinite(snr), snr, -np.inf)), setup
+    return recording, Truth(depth, tilt, setup.speed_m_s, np.where(np.isfinite(snr), snr, -np.inf)), setup
 
 
 def receive(rng: np.random.Generator, setup: Setup, lines: Array, noise: Array, height: float) -> npt.NDArray[np.int16]:
