@@ -21,6 +21,7 @@ UNSTABLE_MM = 1.0  # off the neighbours' median along the beam, while the probe 
 STILL_MM = 2.0  # the probe rests: its origin moved less than this over the neighbours
 REACH = 5  # neighbours on each side
 LEAST_NEIGHBOURS = 4
+AGREEING = 0.7  # of the neighbours are near their median: otherwise they tell nothing of this frame
 
 
 def choose(depth_mm: Array, chance: Array) -> npt.NDArray[np.int64]:
@@ -67,7 +68,10 @@ def clipped_share(recording: Recording, times_s: Array) -> Array:
 
 
 def unstable(recording: Recording, depth_mm: Array, good: Bools, runs: npt.NDArray[np.int64]) -> Bools:
-    """Frames (n,) whose depth leaves that of the neighbours while the probe rests."""
+    """Frames (n,) whose depth leaves the one that the neighbours share while the probe rests.
+
+    Neighbours that do not agree with each other are not looked at: then the probe moves, whatever its pose says.
+    """
     count = len(depth_mm)
     steps = [step for step in range(-REACH, REACH + 1) if step]
     other = np.arange(count)[:, None] + np.array(steps)
@@ -82,7 +86,8 @@ def unstable(recording: Recording, depth_mm: Array, good: Bools, runs: npt.NDArr
     enough = use.sum(axis=1) >= LEAST_NEIGHBOURS
     middle = np.zeros(count)
     middle[enough] = np.nanmedian(ahead[enough], axis=1)
-    return np.asarray(good & enough & (np.abs(middle) > UNSTABLE_MM))
+    near = (np.abs(ahead - middle[:, None]) < UNSTABLE_MM).sum(axis=1)  # not a number compares as false
+    return np.asarray(good & enough & (near >= AGREEING * use.sum(axis=1)) & (np.abs(middle) > UNSTABLE_MM))
 
 
 def reasons_of(

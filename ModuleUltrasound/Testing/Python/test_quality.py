@@ -39,6 +39,12 @@ def test_jump_of_the_depth_under_a_resting_probe_is_unstable():
     assert np.flatnonzero(unstable(a_recording(), depth, good, np.zeros(20, dtype=int))).tolist() == [8]
 
 
+def test_depths_that_share_nothing_are_no_instability():
+    """A recording whose poses never change, of lines from everywhere: no neighbour tells what another should show."""
+    depth = np.random.default_rng(2).uniform(2, 15, 20)
+    assert not unstable(a_recording(), depth, np.ones(20, dtype=bool), np.zeros(20, dtype=int)).any()
+
+
 def test_pressing_is_no_instability():
     recording = a_recording()
     press = np.linspace(0, 1.9, 20)
