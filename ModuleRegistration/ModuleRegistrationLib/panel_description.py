@@ -72,6 +72,8 @@ PANEL = Panel(
             items=(
                 Action("suggestLandmarks", "Suggest landmarks", "Propose landmarks on the skull; check and move each"),
                 ListField("landmark", "Landmarks", "landmarks", "A click places the landmark that is chosen"),
+                Action("moveToSurface", "Move to the bone", "Move the landmark that lies on no surface to the bone", rare=True),
+                Action("exchangeSides", "Exchange left and right", "Give both landmarks each other's place", rare=True),
                 ReadOut("placing", "The next click places"),
                 Action("placeHere", "Place at the cross", "Place the chosen landmark where the slices cross", "P"),
                 Action("undoLandmark", "Undo", "Take back the last change of a landmark", "Ctrl+Z"),
@@ -90,7 +92,7 @@ PANEL = Panel(
                 NodeField("LandmarksPatient", "On the patient"),
                 ParameterField("landmark_fle_mm", "Usual error of a pair"),
                 Action("registerLandmarks", "Register landmarks", "First, rough registration", primary=True),
-                Action("dropMisfit", "Touch the misfit again", "Take out the landmark that does not fit, and touch it again"),
+                Action("dropMisfit", "Touch the misfit again", "Take out the landmark that does not fit", rare=True),
                 ReadOut("fre", "Misfit of the landmarks (FRE, RMS; no accuracy)", "mm"),
             ),
             status="landmarkStatus",

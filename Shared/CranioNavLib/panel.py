@@ -82,6 +82,7 @@ class Entry:
     name: str
     done: bool = False
     note: str = ""  # beside the name
+    doubtful: bool = False  # there is something to look at
 
 
 @dataclass(frozen=True)
@@ -133,13 +134,14 @@ class NodeField:
 
 @dataclass(frozen=True)
 class Action:
-    """A button. `shortcut` in Qt's form ("Ctrl+Z"); `primary` is the step's main one."""
+    """A button. `shortcut` in Qt's form ("Ctrl+Z"); `primary`: the step's main one; `rare`: shown only while it can be used."""
 
     name: str
     label: str
     help: str = ""
     shortcut: str = ""
     primary: bool = False
+    rare: bool = False
 
 
 @dataclass(frozen=True)

@@ -123,6 +123,7 @@ class PanelWidget:
             elif isinstance(item, Action):
                 reason = self.model.blocked(item)
                 self.buttons[item.name].setEnabled(not reason)
+                self.buttons[item.name].setVisible(not (item.rare and reason))
                 self.buttons[item.name].setToolTip(reason or item.help)
         message, busy = self.model.message, self.model.busy
         self._message.setText(f"{LEVEL_SIGNS[message.level]}{message.text}" if message.text else "")

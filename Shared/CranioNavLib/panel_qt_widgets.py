@@ -204,7 +204,7 @@ class Chooser:
         self._shown = (entries, chosen)
         self.widget.clear()
         for one in entries:
-            self.widget.addItem("  ".join(filter(None, ["✓" if one.done else "○", one.name, one.note])))
+            self.widget.addItem("  ".join(filter(None, ["!" if one.doubtful else "✓" if one.done else "○", one.name, one.note])))
         names = [one.name for one in entries]
         self.widget.setCurrentRow(names.index(chosen) if chosen in names else -1)
 

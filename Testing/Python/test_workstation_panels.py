@@ -66,6 +66,23 @@ def touch_landmarks() -> None:
     scene_data.set_points("LandmarksPatient", LabelledPoints(("a", "b", "c", "d"), planned + (5.0, 6.0, 7.0)))
 
 
+def test_a_button_for_what_rarely_goes_wrong_is_shown_only_then(an_empty_scene):
+    view, page = drawn_in_the_web("ModuleRegistration")
+    drawn = drawn_by_qt("ModuleRegistration")
+    touch_landmarks()
+    for wrong in (False, True):
+        if wrong:
+            touched = scene_data.get_points("LandmarksPatient")
+            moved = touched.positions_mm + np.eye(4)[:, :1] * 80.0
+            scene_data.set_points("LandmarksPatient", LabelledPoints(touched.labels, moved))
+        view.refresh()
+        drawn.refresh()
+        assert bool(view.server.state.panel["blocked"]["dropMisfit"]) != wrong
+        assert drawn.buttons["dropMisfit"].isHidden() != wrong
+        assert not drawn.buttons["verify"].isHidden(), "others are grey"
+    assert """v-show="!panel.blocked['dropMisfit']\"""" in page.replace("&#x27;", "'")
+
+
 @pytest.mark.parametrize("name", MODULES)
 def test_everything_described_is_drawn(an_empty_scene, name):
     view, page = drawn_in_the_web(name)

@@ -132,7 +132,9 @@ class PanelView:
         key = f'data-shortcut="{item.shortcut}"' if item.shortcut else ""
         meant = f"{item.help} ({item.shortcut})" if item.shortcut else item.help
         with html.Div(
-            classes="wide" if item.primary else "", title=(f"{self.key}.blocked['{item.name}'] || '{_quoted(meant)}'",)
+            classes="wide" if item.primary else "",
+            title=(f"{self.key}.blocked['{item.name}'] || '{_quoted(meant)}'",),
+            v_show=f"!{self.key}.blocked['{item.name}']" if item.rare else "true",
         ):
             v3.VBtn(
                 item.label,
@@ -196,7 +198,7 @@ class PanelView:
                 key="one.name",
                 active=(f"one.name === {self.key}.fields['{item.name}']",),
                 color="primary",
-                title=("(one.done ? '✓ ' : '○ ') + one.name",),
+                title=("(one.doubtful ? '! ' : one.done ? '✓ ' : '○ ') + one.name",),
                 min_height=34,
                 subtitle=("one.note || undefined",),
                 click=f"trigger('{self.key}_pick', ['{item.name}', one.name])",

@@ -262,6 +262,40 @@ def test_landmarks_are_planned_without_a_mouse_and_each_step_is_taken_back(a_bal
         logic.placeHere()
 
 
+def test_a_landmark_in_the_head_needs_attention_and_is_moved_to_the_bone(a_patient, a_skull):
+    on_bone = a_skull.closest(LANDMARKS).points_mm
+    inside = np.where(np.arange(4)[:, None] == 1, 0.5, 1.0) * on_bone
+    scene_data.set_points("LandmarksCT", LabelledPoints(LABELS, inside))
+    status, entry = a_patient.planStatus(), a_patient.landmarks()[-3]
+    assert (status.state, status.action) == (StepState.ATTENTION, "moveToSurface")
+    assert "Left lies 3" in status.text, "which, and how far"
+    assert (entry.name, entry.doubtful, "off skin and bone" in entry.note) == ("Left", True, True)
+    a_patient.moveToSurface()
+    assert a_patient.planStatus().state is StepState.DONE
+    assert a_patient.moveToSurfaceBlocked()
+    moved = scene_data.get_points("LandmarksCT").positions_mm
+    assert a_skull.closest(moved[1:2]).distances_mm < 0.1
+    a_patient.undoLandmark()
+    np.testing.assert_allclose(scene_data.get_points("LandmarksCT").positions_mm, inside)
+    scene_data.set_points("TargetsCT", LabelledPoints(("Sphere 1",), inside[1:2]))
+    assert a_patient.planStatus().state is StepState.DONE, "a marker that the CT shows stands where it stands"
+
+
+def test_left_and_right_exchanged_need_attention_and_are_exchanged_back(a_patient, a_skull):
+    on_bone = a_skull.closest(LANDMARKS).points_mm
+    scene_data.set_points("LandmarksCT", LabelledPoints(LABELS, on_bone[[0, 2, 1, 3]]))
+    status = a_patient.planStatus()
+    assert (status.state, status.action, "Left and Right" in status.text) == (StepState.ATTENTION, "exchangeSides", True)
+    assert [one.name for one in a_patient.landmarks() if one.doubtful] == ["Left", "Right"]
+    a_patient.exchangeSides()
+    np.testing.assert_allclose(scene_data.get_points("LandmarksCT").positions_mm, on_bone, atol=1e-6)
+    assert a_patient.planStatus().state is StepState.DONE
+    assert a_patient.exchangeSidesBlocked()
+    a_patient.planned.put("Right", on_bone[1] * (0.99, 1, 1))
+    a_patient.planned.remove("Left")
+    assert "Right lies on the other side" in a_patient.planStatus().text
+
+
 def test_a_further_landmark_waits_for_its_click_until_told_otherwise(a_ball_in_air):
     logic = a_ball_in_air
     assert "Landmark 5" in logic.addLandmark()
