@@ -24,7 +24,7 @@ BAND_WIDTH = 0.75  # full width at half amplitude, of the transducer's frequency
 BAND_EDGES = (0.25, 1.9)  # of the transducer's frequency: nothing outside gets through (drift, spikes' upper part)
 LEAST_DRIFT = 8.0  # codes over a line: less makes no step that matters
 FADE_CYCLES = 1.5
-BLOCK = 32  # lines transformed at once: the working set stays in the processor's second cache
+BLOCK = 16  # lines transformed at once: the working set stays in the processor's second cache
 OVERSAMPLING = 4.0  # complex samples a cycle of the transducer's frequency
 
 
@@ -39,17 +39,23 @@ class Envelopes:
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """The band-pass of a recording: which bins of the line's spectrum pass, and how much."""
+    """The band-pass of a recording: which bins of the line's spectrum pass, and how much.
+
+    Bins are counted in numbers: real and imaginary part of each. What is multiplied to a block of lines is kept once for each
+    line, because numpy works on whole arrays several times as fast as on their rows.
+    """
 
     length: int  # samples of a line that are used
     padded: int  # FFT length
-    first: int  # first bin that passes
-    gain: Floats  # of each bin that passes
-    centre: int  # the bin of the carrier
+    passed: slice  # of the line's spectrum
+    gain: Floats  # (BLOCK, B) of what passes
+    trend: Floats  # (2, B) what passes of a constant 1 and of `ramp`
+    below: int  # how much of it lies below the carrier
     out_length: int  # FFT length of the envelope
     rate_hz: float
     carrier_hz: float
     fade: Floats  # weights of a line's last samples: a hum that is cut off would pass the band
+    quarter: Floats  # weights of a mean over a quarter of the line
 
 
 def check_acquisition(acquisition: Acquisition) -> None:
@@ -90,57 +96,62 @@ def design_band(acquisition: Acquisition, samples: int, until_s: float) -> Band:
     gain = np.exp(-0.5 * ((frequencies - BAND_CENTRE * centre) / sigma) ** 2)
     middle = round(BAND_CENTRE * centre / step)
     out_length = int(scipy.fft.next_fast_len(max(int(np.ceil(OVERSAMPLING * centre / step)), last - first)))
+    fade = np.cos(np.linspace(0, np.pi / 2, min(max(int(FADE_CYCLES * sampling / centre), 2), length))) ** 2
+    gain *= 2.0 * out_length / padded  # twice: the negative frequencies are left out
+    trend = scipy.fft.rfft(_trend(length) * np.concatenate([np.ones(length - len(fade)), fade]), padded, axis=1)
     return Band(
         length=length,
         padded=padded,
-        first=first,
-        gain=(2.0 * gain).astype(np.float32),  # twice: the negative frequencies are left out
-        centre=middle,
+        passed=slice(2 * first, 2 * last),
+        gain=np.tile(np.repeat(gain, 2).astype(np.float32), (BLOCK, 1)),
+        trend=(trend[:, first:last] * gain).astype(np.complex64).view(np.float32),
+        below=2 * (middle - first),
         out_length=out_length,
         rate_hz=out_length * step,
         carrier_hz=middle * step,
-        fade=np.cos(np.linspace(0, np.pi / 2, min(max(int(FADE_CYCLES * sampling / centre), 2), length))).astype(np.float32) ** 2,
+        fade=fade.astype(np.float32),
+        quarter=np.full(max(length // 4, 1), 1 / max(length // 4, 1), dtype=np.float32),
     )
+
+
+def _trend(length: int) -> npt.NDArray[np.float64]:
+    """Offset and drift (2, N) of a line, the drift none in the middle of its last quarter."""
+    return np.stack([np.ones(length), np.arange(length) - (length - max(length // 4, 1) / 2 - 0.5)])
 
 
 def complex_envelopes(lines: npt.NDArray[np.int16], band: Band) -> Envelopes:
     """Complex envelopes of RF lines (n, N): DC and drift removed, band-passed without phase, demodulated."""
-    size = len(band.gain)
-    below = band.centre - band.first
-    gain = band.gain * np.float32(band.out_length / band.padded)
+    size, below = band.gain.shape[1], band.below
     keep = min(band.out_length, int(np.ceil(band.length * band.out_length / band.padded)))
     values = np.empty((len(lines), keep), dtype=np.complex64)
     rows = min(BLOCK, len(lines))
     whole = np.zeros((rows, band.padded), dtype=np.float32)
-    shifted = np.zeros((rows, band.out_length), dtype=np.complex64)
+    shifted = np.zeros((rows, 2 * band.out_length), dtype=np.float32)
     for start in range(0, len(lines), BLOCK):
         some = lines[start : start + BLOCK, : band.length]
-        rf = whole[: len(some), : band.length]
-        rf[:] = some
-        remove_drift(rf)
-        rf[:, band.length - len(band.fade) :] *= band.fade
-        spectrum = scipy.fft.rfft(whole[: len(some)], axis=1)[:, band.first : band.first + size]
-        turned = shifted[: len(some)]
-        np.multiply(spectrum[:, below:], gain[below:], out=turned[:, : size - below])
-        np.multiply(spectrum[:, :below], gain[:below], out=turned[:, band.out_length - below :])
-        values[start : start + BLOCK] = scipy.fft.ifft(turned, axis=1)[:, :keep]
+        rf = whole[: len(some)]
+        rf[:, : band.length] = some
+        trend = trends(rf[:, : band.length], band)
+        rf[:, band.length - len(band.fade) : band.length] *= band.fade
+        spectrum = scipy.fft.rfft(rf, axis=1).view(np.float32)[:, band.passed].copy()
+        spectrum *= band.gain[: len(some)]
+        spectrum -= trend @ band.trend
+        turned = shifted[: len(some)]  # the carrier comes first, what lies below it last
+        turned[:, : size - below] = spectrum[:, below:]
+        turned[:, 2 * band.out_length - below :] = spectrum[:, :below]
+        values[start : start + BLOCK] = scipy.fft.ifft(turned.view(np.complex64), axis=1)[:, :keep]
     return Envelopes(values=values, rate_hz=band.rate_hz, carrier_hz=band.carrier_hz)
 
 
-def remove_drift(rf: Floats) -> None:
-    """Take the offset out of lines (n, N), in place, and their straight-line drift where they have one.
+def trends(rf: Floats, band: Band) -> Floats:
+    """Offset and straight-line drift (n, 2) of lines (n, N), the drift 0 where it makes no step that matters.
 
     Both are taken from the quiet second half. Slower waves are left to the band-pass; only the step between a line's end and
     its start would pass it.
     """
-    length = rf.shape[1]
-    quarter = max(length // 4, 1)
-    weights = np.full(quarter, 1 / quarter, dtype=np.float32)
-    third = rf[:, max(length - 2 * quarter, 0) : max(length - 2 * quarter, 0) + quarter] @ weights
-    fourth = rf[:, -quarter:] @ weights
-    slope = (fourth - third) / np.float32(quarter)
-    rf -= fourth[:, None]
-    drifting = np.flatnonzero(np.abs(slope) * length > LEAST_DRIFT)
-    if len(drifting):
-        ramp = np.arange(length, dtype=np.float32) - np.float32(length - quarter / 2 - 0.5)
-        rf[drifting] -= slope[drifting, None] * ramp
+    quarter, length = len(band.quarter), rf.shape[1]
+    before = max(length - 2 * quarter, 0)
+    offset = rf[:, length - quarter :] @ band.quarter
+    slope = (offset - rf[:, before : before + quarter] @ band.quarter) / np.float32(quarter)
+    slope[np.abs(slope) * length <= LEAST_DRIFT] = 0
+    return np.stack([offset, slope], axis=1)
