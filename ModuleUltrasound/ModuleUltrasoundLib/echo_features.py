@@ -17,104 +17,119 @@ from ModuleUltrasoundLib.signal_forerun import MULTIPLES, Forerun
 
 FAR_MM = 12.0  # stands for "there is none" in distances between echoes
 FAR_DB = 40.0
+APART_MM = 0.3  # nearer echoes are one
 CLEAR_DB = 34.0  # over the noise: an echo that is clearer still is no other kind of echo
 MULTIPLE_EARLY_CYCLES = 1.6  # a multiple carries the pulse's delay once, its prediction from the first echo twice
 MULTIPLE_TOLERANCE_S = 2e-7
 REPEATED = 0.5  # of the likeness of a place to that of a multiple: beyond, an echo there is not compared with others
 REVERBERATION_TOLERANCE_S = 2.5e-7
 
-NAMES = (
-    "snr", "salience", "before", "after", "before all", "after all", "drop", "drop all", "stronger before", "its distance",
-    "stronger behind", "its distance behind", "depth", "loss", "multiple", "multiple share", "forerun", "has forerun",
-    "reverberation", "width", "rank before", "rank behind", "line snr", "next best",
-    "frequency", "frequency against before", "frequency against behind", "rise", "fall", "end of line", "own reverberation",
-)  # fmt: skip
+UNITS = {  # what each number is counted in, so that all are of order one
+    "snr": 20, "salience": 10, "before": 10, "after": 10, "before all": 10, "after all": 10, "drop": 10, "drop all": 10,
+    "stronger before": 15, "its distance": 5, "stronger behind": 15, "its distance behind": 5, "depth": 8, "loss": 50,
+    "multiple": 1, "multiple share": 15, "forerun": 30, "has forerun": 1, "reverberation": 15, "width": 1,
+    "rank before": 3, "rank behind": 3, "line snr": 20, "next best": 15, "frequency": 0.2, "frequency against before": 0.2,
+    "frequency against behind": 0.2, "rise": 15, "fall": 15, "end of line": 15, "own reverberation": 15,
+}  # fmt: skip
+NAMES = tuple(UNITS)
+_DIVISORS = np.array(list(UNITS.values()), dtype=np.float32)[:, None, None]
 
 
 def line_features(
     candidates: Candidates, forerun: Forerun, nominal_skin_s: float, transducer_hz: float, speed_m_s: float
 ) -> Array:
-    """Features (n, K, len(NAMES)) of each candidate from its own line alone; NaN candidates give finite numbers."""
-    snr = candidates.snrs_db.astype(np.float32)
-    valid = np.isfinite(snr)
-    depth = np.where(valid, candidates.delays_s * 500 * speed_m_s, 0.0).astype(np.float32)
-    snr = np.where(valid, snr, np.float32(-FAR_DB))
-    pair = snr[:, None, :] - snr[:, :, None]  # [line, one, other]: how much stronger the other is
-    gap = depth[:, None, :] - depth[:, :, None]
-    multiple, share = _multiples(candidates, forerun, nominal_skin_s, transducer_hz, valid)
+    """Features (n, K, len(NAMES)) of each candidate from its own line alone; NaN candidates give finite numbers.
+
+    Inside, the lines are the last axis: numpy's inner loops then run over many lines instead of a few candidates.
+    """
+    valid = ~np.isnan(candidates.amplitudes.T)
+    delays, amplitudes, frequencies, widths, saliences, rise, fall, end, *stretches = _numbers(candidates)
+    level = DECIBEL * np.log(np.maximum(amplitudes, np.float32(1e-9)))
+    snr = np.where(valid, level - (DECIBEL * np.log(candidates.noise)).astype(np.float32), np.float32(-FAR_DB))
+    depth = delays * np.float32(500 * speed_m_s)
+    frequency = np.where(valid, frequencies / np.float32(transducer_hz) - np.float32(0.92), np.float32(0))
+    before, after, before_all, after_all = np.minimum(np.maximum(stretches, np.float32(-5)), np.float32(60))
+    over = _over_forerun(level, forerun)
+    multiple = _multiples(delays, forerun, nominal_skin_s, transducer_hz, valid)
     real = valid & (multiple < REPEATED)  # the forerun's own repetitions say nothing about the tissue's echoes
-    both = real[:, None, :] & valid[:, :, None]
-    before, behind = both & (gap < -0.3), both & (gap > 0.3)
-    best_before, far_before, which_before = _strongest(pair, gap, before)
-    best_behind, far_behind, which_behind = _strongest(pair, gap, behind)
-    rows = np.arange(len(snr))[:, None]
-    frequency = np.where(valid, candidates.frequencies_hz / transducer_hz - 0.92, 0.0)
-    lower = [
-        np.where(where.any(axis=2), frequency - frequency[rows, which], 0.0)
-        for where, which in ((before, which_before), (behind, which_behind))
-    ]
-    reverberation, own = _reverberations(candidates, pair, before)
-    seen = forerun.amplitude[:, None] > 0
-    over_forerun = np.where(
-        seen, DECIBEL * np.log(np.maximum(candidates.amplitudes, 1e-9) / np.maximum(forerun.amplitude[:, None], 1e-9)), 0.0
-    )
-    megahertz = transducer_hz * 1e-6
-    stretches = np.stack([candidates.before_db, candidates.after_db, candidates.before_all_db, candidates.after_all_db])
-    levels = np.clip(np.nan_to_num(stretches, nan=0.0), -5, 60)
-    strongest = np.where(real, snr, np.float32(-FAR_DB)).max(axis=1, keepdims=True, initial=-FAR_DB)
-    clear = np.minimum(snr, CLEAR_DB)
-    features = [
-        clear / 20, candidates.saliences_db / 10, levels[0] / 10, levels[1] / 10, levels[2] / 10, levels[3] / 10,
-        (levels[0] - levels[1]) / 10, (levels[2] - levels[3]) / 10, best_before / 15, far_before / 5,
-        best_behind / 15, far_behind / 5, depth / 8, depth * megahertz / 50, multiple, share / 15, over_forerun / 30,
-        np.broadcast_to(seen, snr.shape).astype(float), reverberation / 15, candidates.widths_s * transducer_hz,
-        (before & (pair > -8)).sum(axis=2) / 3.0, (behind & (pair > -8)).sum(axis=2) / 3.0,
-        np.broadcast_to(np.minimum(strongest, CLEAR_DB), snr.shape) / 20, (strongest - snr) / 15,
-        frequency * 5, lower[0] * 5, lower[1] * 5, candidates.rise_db / 15, candidates.fall_db / 15,
-        candidates.end_db / 15, own / 15,
-    ]  # fmt: skip
-    stacked = np.zeros((*snr.shape, len(NAMES)), dtype=np.float32)
-    for number, feature in enumerate(features):
-        stacked[..., number] = feature
-    stacked[~valid] = 0
-    np.nan_to_num(stacked, copy=False)
-    return np.asarray(np.clip(stacked, -4, 4, out=stacked))
+    pair = snr - snr[:, None]  # [one, other, line]: how much stronger the other is
+    gap = depth - depth[:, None]
+    sides = np.stack([gap < -APART_MM, gap > APART_MM])  # [before or behind, one, other, line]
+    sides &= real & valid[:, None]
+    stronger, far, lower = _strongest(pair, depth, frequency, sides)
+    rank = (sides & (pair > -8)).sum(axis=2, dtype=np.float32)
+    reverberation, own = _reverberations(delays, pair, sides[0])
+    strongest = np.where(real, snr, np.float32(-FAR_DB)).max(axis=0, initial=-FAR_DB)
+    features = (
+        np.minimum(snr, CLEAR_DB), saliences, before, after, before_all, after_all, before - after, before_all - after_all,
+        stronger[0], far[0], stronger[1], far[1], depth, depth * np.float32(transducer_hz * 1e-6),
+        multiple, over * multiple, over, forerun.amplitude > 0, reverberation, widths * np.float32(transducer_hz),
+        rank[0], rank[1], np.minimum(strongest, CLEAR_DB), strongest - snr,
+        frequency, lower[0], lower[1], rise, fall, end, own,
+    )  # fmt: skip
+    stacked = np.empty((len(NAMES), *snr.shape), dtype=np.float32)
+    for row, feature in zip(stacked, features):
+        row[...] = feature
+    stacked /= _DIVISORS
+    stacked *= valid.astype(np.float32)
+    np.minimum(np.maximum(stacked, -4, out=stacked), 4, out=stacked)
+    return np.ascontiguousarray(stacked.T)
 
 
-def _strongest(pair: Floats, gap: Floats, where: Array) -> tuple[Array, Array, npt.NDArray[np.int64]]:
-    """How much stronger (dB) the strongest echo of those `where` is, how far (mm) away it lies, and which it is."""
+def _numbers(candidates: Candidates) -> Floats:
+    """What the features are made of, each (K, n); 0 where there is no candidate or the stretch is empty."""
+    names = (
+        "delays_s", "amplitudes", "frequencies_hz", "widths_s", "saliences_db", "rise_db", "fall_db", "end_db",
+        "before_db", "after_db", "before_all_db", "after_all_db",
+    )  # fmt: skip
+    numbers = np.empty((len(names), *candidates.amplitudes.T.shape), dtype=np.float32)
+    for row, name in zip(numbers, names):
+        row[...] = getattr(candidates, name).T
+    numbers[np.isnan(numbers)] = 0
+    return numbers
+
+
+def _over_forerun(level: Floats, forerun: Forerun) -> Floats:
+    """Level of each candidate (K, n) over the forerun's echo, dB; 0 without one."""
+    face = (DECIBEL * np.log(np.maximum(forerun.amplitude, 1e-9))).astype(np.float32)
+    return np.asarray(np.where(forerun.amplitude > 0, level - face, np.float32(0)))
+
+
+def _strongest(pair: Floats, depth: Floats, frequency: Floats, where: npt.NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
+    """Of the strongest of those `where` is (sides, K, K, n): how much stronger (dB) it is, how far (mm) away it lies, and how
+    much lower than its frequency each echo's own is, all (sides, K, n)."""
     masked = np.where(where, pair, np.float32(-FAR_DB))
-    which = masked.argmax(axis=2)
-    rows, columns = np.arange(len(pair))[:, None], np.arange(pair.shape[1])
-    best = masked[rows, columns, which]
-    far = np.where(where.any(axis=2), np.minimum(np.abs(gap[rows, columns, which]), FAR_MM), FAR_MM)
-    return np.clip(best, -FAR_DB, FAR_DB), far, which
+    best = masked.max(axis=2)
+    weaker = (masked != best[:, :, None]).view(np.uint8)
+    count, lines = depth.shape
+    # the first of the strongest: argmax over an axis that is not the last one would copy everything
+    which = (weaker * np.uint8(count) + np.arange(count, dtype=np.uint8)[:, None]).min(axis=2, initial=count - 1)
+    at = which * np.int64(lines) + np.arange(lines)
+    some = where.any(axis=2)
+    far = np.where(some, np.minimum(np.abs(depth.reshape(-1).take(at) - depth), FAR_MM), np.float32(FAR_MM))
+    lower = np.where(some, frequency - frequency.reshape(-1).take(at), np.float32(0))
+    return np.minimum(np.maximum(best, -FAR_DB), FAR_DB), far, lower
 
 
 def _multiples(
-    candidates: Candidates, forerun: Forerun, nominal_skin_s: float, transducer_hz: float, valid: Array
-) -> tuple[Array, Array]:
-    """Whether a candidate lies where the forerun's echo repeats, and its strength over the forerun's echo there (dB)."""
-    place = np.zeros(valid.shape)
-    share = np.zeros(valid.shape)
+    delays: Floats, forerun: Forerun, nominal_skin_s: float, transducer_hz: float, valid: npt.NDArray[np.bool_]
+) -> Floats:
+    """How much a candidate (K, n) lies where the forerun's echo repeats, 0 to 1."""
     if nominal_skin_s <= 0:
-        return place, share
-    for number in range(2, MULTIPLES + 1):
-        late = candidates.delays_s - (number - 1) * forerun.skin_s[:, None]
-        off = np.maximum(late, -late - (number - 1) * MULTIPLE_EARLY_CYCLES / transducer_hz) / MULTIPLE_TOLERANCE_S
-        off = np.maximum(np.nan_to_num(off, nan=9.0), 0.0)
-        place = np.maximum(place, np.where(valid, np.exp(-(off**2)), 0.0))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        over = DECIBEL * np.log(candidates.amplitudes / forerun.amplitude[:, None])
-    share = np.where(valid & np.isfinite(over), over, 0.0) * place
-    return place, share
+        return np.zeros(delays.shape, dtype=np.float32)
+    times = np.arange(1, MULTIPLES, dtype=np.float32)[:, None, None]
+    late = delays - times * forerun.skin_s.astype(np.float32)
+    off = np.maximum(late, -late - times * np.float32(MULTIPLE_EARLY_CYCLES / transducer_hz)).min(axis=0)
+    off = np.maximum(off, 0) / np.float32(MULTIPLE_TOLERANCE_S)
+    return np.asarray(np.exp(-(off**2)) * valid)
 
 
-def _reverberations(candidates: Candidates, pair: Floats, before: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
+def _reverberations(delays: Floats, pair: Floats, before: npt.NDArray[np.bool_]) -> tuple[Floats, Floats]:
     """How much stronger (dB) an earlier echo is of which this one would be the first reverberation under the skin, and how
     near in strength the echo comes that would be this one's: bone under a flat skin has one."""
-    delays = np.nan_to_num(candidates.delays_s)
-    off = np.abs(delays[:, :, None] - 2 * delays[:, None, :])
-    hit = before & (off < REVERBERATION_TOLERANCE_S)
-    earlier = np.where(hit, np.clip(pair, 0, FAR_DB), 0.0).max(axis=2)
-    return earlier, np.where(hit, np.clip(FAR_DB - pair, 0, FAR_DB), 0.0).max(axis=1)
+    late, early, line = np.nonzero(before & (np.abs(delays[:, None] - 2 * delays) < REVERBERATION_TOLERANCE_S))  # seldom any
+    stronger = pair[late, early, line]
+    source, own = np.zeros_like(delays), np.zeros_like(delays)
+    np.maximum.at(source, (late, line), np.minimum(stronger, FAR_DB))
+    np.maximum.at(own, (early, line), np.minimum(FAR_DB - stronger, FAR_DB))
+    return source, own
