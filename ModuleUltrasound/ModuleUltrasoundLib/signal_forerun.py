@@ -14,6 +14,7 @@ from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Acquisition
 
 from ModuleUltrasoundLib.echo_candidates import fit_tops
+from ModuleUltrasoundLib.echo_timing import shift_windows
 from ModuleUltrasoundLib.signal_chain import Envelopes
 
 SEARCH = 0.04  # of the nominal time: temperature changes the delay line's speed by 1 to 3 %, and its length is machined
@@ -144,23 +145,40 @@ def suppress_multiples(
     if first.min() < half:
         return
     pulse = values[rows, first[:, None] + window]
-    power = (np.abs(pulse) ** 2).sum(axis=1)
+    late = (
+        rate * _running(forerun.skin_s[lines], NEIGHBOURS) / _running(np.ones(len(lines)), NEIGHBOURS)
+    )  # free of trigger jitter
     for number in range(2, MULTIPLES + 1):
         # the first echo's centre stands at the nominal time plus the pulse's delay, which the multiple carries once only
-        lag = np.rint(forerun.skin_s[lines] * (number - 1) * rate).astype(np.int64)
+        lag = np.rint(late * (number - 1)).astype(np.int64)
+        rounded = late * (number - 1) - lag
         if (first + lag).max() + half + 1 >= envelopes.values.shape[1]:
             break
         lag += _best_shift(values, rows, first + lag, pulse, window, reach)
         place = (first + lag)[:, None] + window
-        turn = np.exp(-2j * np.pi * carrier * lag / rate)  # the carrier's phase between the two places
-        strength = (values[rows, place] * pulse.conj()).sum(axis=1) / power / turn
+        turn = np.exp(-2j * np.pi * carrier * (lag + rounded) / rate).astype(np.complex64)[:, None]  # of the carrier's phase
+        there = values[rows, place] / turn
+        moved = shift_windows(pulse, -_offset(there, pulse, rounded))
+        strength = (there * moved.conj()).sum(axis=1) / (np.abs(moved) ** 2).sum(axis=1)
         typical = complex(np.median(strength.real), np.median(strength.imag))
         coherence = np.abs(np.mean(strength / (np.abs(strength) + 1e-12)))
         if coherence < LEAST_COHERENCE or abs(typical) > 1:
             continue
-        cleaned = values[rows, place] - (typical * turn).astype(np.complex64)[:, None] * pulse
+        cleaned = (there - np.complex64(typical) * moved) * turn
         values[rows, place] = cleaned
         magnitude[rows, place] = np.abs(cleaned)
+
+
+def _offset(there: npt.NDArray[np.complex64], pulse: npt.NDArray[np.complex64], rounded: Array) -> Array:
+    """How many samples (n,) the pulse stands behind the middle of each line's window, less than one: what is common to all
+    lines (the pulse's own delay) and what each line's place was `rounded` by."""
+    slope = np.gradient(pulse, axis=1)
+    each = (pulse.conj() * there).sum(axis=1) / (np.abs(pulse) ** 2).sum(axis=1)
+    typical = complex(np.median(each.real), np.median(each.imag)) or 1.0
+    rest = there / np.complex64(typical) - pulse
+    steps = -(slope.conj() * rest).sum(axis=1).real / np.maximum((np.abs(slope) ** 2).sum(axis=1), 1e-12)
+    common = float(np.median(steps - rounded))
+    return np.asarray(np.clip(common + rounded, -1.0, 1.0), dtype=np.float64)
 
 
 def _best_shift(

@@ -73,6 +73,18 @@ def test_multiples_are_suppressed_and_bone_is_kept():
     assert magnitude[rows, bones] == pytest.approx(kept, rel=0.05)
 
 
+def test_strong_multiples_between_two_samples_leave_only_noise():
+    """A face far stronger than any echo of tissue, a delay line that warms, a trigger that jitters."""
+    rng = np.random.default_rng(4)
+    jitter, skin = rng.normal(0, 5e-9, 60), SKIN_S * (1 + np.linspace(0, 0.002, 60))
+    envelopes, magnitude = lines_with([(skin + jitter, 3.0), (2 * skin + jitter, -1.0)], count=60)
+    at = np.rint(2 * skin * envelopes.rate_hz).astype(int)[:, None] + np.arange(-6, 7)
+    rows = np.arange(60)[:, None]
+    before = magnitude[rows, at].max(axis=1)
+    suppress_multiples(envelopes, magnitude, forerun_of(envelopes, magnitude), ACQUISITION)
+    assert np.median(magnitude[rows, at].max(axis=1) / before) < 0.05
+
+
 def test_steadied_times_lose_the_noise_and_keep_a_drift():
     true = SKIN_S * (1 + np.linspace(0, 0.004, 400))
     envelopes, magnitude = lines_with([(true, -0.05), (true + 8e-6, 0.5)], count=400, noise=0.006)
