@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.rigid import Array
 
+from ModuleUltrasoundLib.lean import Scalar, clip, median
 from ModuleUltrasoundLib.signal_chain import Envelopes, Floats
 
 CANDIDATES = 8  # echoes kept of a line
@@ -25,6 +26,7 @@ SALIENCE_GUARD_CYCLES = 2.0
 BARRED = np.float32(1e30)
 ROWS = 64  # lines worked on at once: the working set stays in the processor's second cache
 TILE = 32  # samples whose running sums are one product with a small matrix
+_STEPS = np.array([-1, 0, 1])[:, None, None]
 _SUM_UP = np.triu(np.ones((TILE, TILE), dtype=np.float32), k=1)
 
 
@@ -57,49 +59,45 @@ class Candidates:
 class Levels:
     """Running sums of a batch's logarithmic envelope, from which mean levels of any stretch follow at once."""
 
-    log: Floats  # (n, M) natural logarithm of the envelope
     sums: Floats  # (n, M + 1 or more) of the first 0, 1, ... M samples
+    length: int  # M
 
-    def mean(self, first: npt.NDArray[np.int64], last: npt.NDArray[np.int64]) -> Array:
-        """Mean logarithm over [first, last) of each line, indices (n, K); NaN for empty stretches."""
-        length, size = self.log.shape[1], self.sums.shape[1]
-        first, last = (np.minimum(np.maximum(index, 0), length) for index in (first, last))
-        flat, start = self.sums.reshape(-1), np.arange(0, self.sums.size, size)[:, None]
+    def mean(self, first: npt.NDArray[np.int64], last: npt.NDArray[np.int64]) -> Floats:
+        """Mean logarithm over [first, last) of each line, indices (..., n); NaN for empty stretches."""
+        first, last = clip(first, 0, self.length), clip(last, 0, self.length)
+        flat, start = self.sums.reshape(-1), np.arange(0, self.sums.size, self.sums.shape[1])
         total = flat.take(last + start) - flat.take(first + start)
-        count = last - first
-        return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan), dtype=np.float32)
-
-    def means(self, *stretches: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]) -> list[Array]:
-        """As mean, for several stretches at once."""
-        first, last = (np.concatenate([stretch[k] for stretch in stretches], axis=1) for k in (0, 1))
-        mean, width = self.mean(first, last), first.shape[1] // len(stretches)
-        return [mean[:, k : k + width] for k in range(0, mean.shape[1], width)]
+        count = (last - first).astype(np.float32)
+        count[count <= 0] = np.nan
+        return np.asarray(total / count)
 
 
-def take_levels(magnitude: Floats) -> Levels:
-    """Logarithmic levels of a batch of envelopes (n, M)."""
-    count, length = magnitude.shape
-    log = np.zeros((count, (length // TILE + 1) * TILE), dtype=np.float32)
-    sums = np.empty_like(log)
-    for start in range(0, count, ROWS):
-        some = log[start : start + ROWS]
-        some[:, :length] = magnitude[start : start + ROWS]
-        some += np.float32(1e-3)  # a thousandth of a code: far below any converter's noise
-        np.log(some, out=some)
-        # within tiles by a matrix, then the tiles before: a third of the time of cumsum
-        tiles = (some.reshape(-1, TILE) @ _SUM_UP).reshape(len(some), -1, TILE)
-        before = np.zeros(tiles.shape[:2], dtype=np.float32)
-        np.cumsum(tiles[:, :-1, -1] + some[:, TILE - 1 : -1 : TILE], axis=1, out=before[:, 1:])
-        np.add(tiles.reshape(len(some), -1), np.repeat(before, TILE, axis=1), out=sums[start : start + ROWS])
-    return Levels(log[:, :length], sums)
+def padded(length: int) -> int:
+    """Columns of whole tiles for `length` samples and one more."""
+    return (length // TILE + 1) * TILE
+
+
+def logarithm(magnitude: Floats) -> Floats:
+    """Natural logarithm of envelopes (n, M), with columns behind them that fill the last tile."""
+    log = np.zeros((len(magnitude), padded(magnitude.shape[1])), dtype=np.float32)
+    log[:, : magnitude.shape[1]] = magnitude
+    log += np.float32(1e-3)  # a thousandth of a code: far below any converter's noise
+    return np.asarray(np.log(log, out=log))
+
+
+def take_levels(log: Floats, length: int, sums: Floats | None = None) -> Levels:
+    """Levels of envelopes of `length` samples from their `logarithm`; the sums are written to `sums` if given."""
+    # within tiles by a matrix, then the tiles before: a third of the time of cumsum
+    tiles = (log.reshape(-1, TILE) @ _SUM_UP).reshape(len(log), -1, TILE)
+    before = np.zeros(tiles.shape[:2], dtype=np.float32)
+    np.cumsum(tiles[:, :-1, -1] + log[:, TILE - 1 : -1 : TILE], axis=1, out=before[:, 1:])
+    return Levels(np.add(tiles.reshape(log.shape), np.repeat(before, TILE, axis=1), out=sums), length)
 
 
 def noise_level(levels: Levels) -> Array:
     """Standard deviation of one quadrature of each line's noise, from its quietest stretch, shape (n,)."""
-    length = levels.log.shape[1]
-    edges = np.linspace(0, length, NOISE_BLOCKS + 1).astype(np.int64)
-    means = (levels.sums[:, edges[1:]] - levels.sums[:, edges[:-1]]) / np.maximum(np.diff(edges), 1)
-    return np.asarray(np.exp(means.min(axis=1).astype(float) - LOG_RAYLEIGH))
+    edges = np.linspace(0, levels.length, NOISE_BLOCKS + 1).astype(np.int64)[:, None]
+    return np.asarray(np.exp(np.fmin.reduce(levels.mean(edges[:-1], edges[1:])).astype(float) - LOG_RAYLEIGH))
 
 
 def rough_noise(magnitude: Floats) -> Array:
@@ -119,18 +117,28 @@ def refine_peaks(magnitude: Floats, samples: npt.NDArray[np.int64]) -> tuple[Arr
 
 def fit_tops(magnitude: Floats, samples: npt.NDArray[np.int64]) -> tuple[Array, Array, Array]:
     """As refine_peaks, and the standard deviation (samples) of the Gaussian that has each peak's curvature."""
-    safe = np.clip(samples, 1, magnitude.shape[1] - 2)
-    rows = np.arange(len(magnitude))[:, None]
-    left, mid, right = (np.log(magnitude[rows, safe + step].astype(float) + 1e-9) for step in (-1, 0, 1))
+    number = samples.T
+    safe = clip(number, 1, magnitude.shape[1] - 2)
+    around = _at(magnitude, safe + _STEPS)
+    left, mid, right = np.log(around.astype(float) + 1e-9)
     curvature = np.minimum(left - 2 * mid + right, -1e-6)
-    offset = np.clip(0.5 * (left - right) / curvature, -0.5, 0.5)
-    height = np.exp(mid - 0.25 * (left - right) * offset)
-    bad = samples < 0
-    return np.where(bad, np.nan, safe + offset), np.where(bad, np.nan, height), np.where(bad, np.nan, np.sqrt(-1 / curvature))
+    slope = left - right
+    offset = clip(0.5 * slope / curvature, -0.5, 0.5)
+    height = np.exp(mid - 0.25 * slope * offset)
+    position, width = safe + offset, np.sqrt(-1 / curvature)
+    bad = number < 0
+    for values in (position, height, width):
+        values[bad] = np.nan
+    return position.T, height.T, width.T
+
+
+def _at(values: npt.NDArray[Scalar], samples: npt.NDArray[np.int64]) -> npt.NDArray[Scalar]:
+    """Samples (..., n) of each line of values (n, M)."""
+    return np.asarray(values.reshape(-1).take(samples + np.arange(0, values.size, values.shape[1])))
 
 
 def salient_peaks(
-    levels: Levels, rate_hz: float, rise_db_per_s: float, first: int, last: int, guard_s: float
+    log: Floats, levels: Levels, rate_hz: float, rise_db_per_s: float, first: int, last: int, guard_s: float
 ) -> npt.NDArray[np.int64]:
     """Indices (n, K) of the local maxima in [first, last) that stand out most from what surrounds them; -1 pads.
 
@@ -138,25 +146,20 @@ def salient_peaks(
     interface before it is kept; the level itself, raised by the tissue's attenuation, counts too.
     """
     guard = max(int(guard_s * rate_hz), 1)
-    length = min(max(int(SALIENCE_S * rate_hz) - guard, 2), levels.log.shape[1])
-    rise = np.arange(last - first) * (RISE_WEIGHT * rise_db_per_s / rate_hz / DECIBEL)
-    samples = np.empty((len(levels.log), CANDIDATES), dtype=np.int64)
-    for start in range(0, len(samples), ROWS):
-        rows = slice(start, start + ROWS)
-        score = _salience(Levels(levels.log[rows], levels.sums[rows]), first, last, guard, length, rise.astype(np.float32))
-        samples[rows] = _highest(score)
-    return np.asarray(np.where(samples < 0, -1, samples + first + 1))
+    length = min(max(int(SALIENCE_S * rate_hz) - guard, 2), levels.length)
+    rise = np.arange(1, last - first - 1) * (RISE_WEIGHT * rise_db_per_s / rate_hz / DECIBEL)
+    return _highest(_salience(log, levels, first, last, guard, length, rise.astype(np.float32)), first + 1)
 
 
-def _salience(levels: Levels, first: int, last: int, guard: int, length: int, rise: Floats) -> Floats:
+def _salience(log: Floats, levels: Levels, first: int, last: int, guard: int, length: int, rise: Floats) -> Floats:
     """How much each local maximum between `first` and `last` stands out, shape (n, last - first - 2); other samples are barred.
 
     All lines lie behind one another, so that a shift by some samples is a piece of one long row: numpy works on it several
     times as fast as on rows. What runs over from one line into the next lies in margins that are cut off.
     """
-    lead, size = guard + length, levels.log.shape[1]
+    lead, size = guard + length, levels.length
     least, most = first - lead, last + lead
-    log, sums = _columns(levels.log, least, most), _columns(levels.sums, least, most)
+    log, sums = _columns(log, least, most), _columns(levels.sums, least, most)
     width = most - least
     mean = np.zeros_like(sums)  # of [sample, sample + length)
     np.subtract(sums.reshape(-1)[length:], sums.reshape(-1)[:-length], out=mean.reshape(-1)[:-length])
@@ -173,7 +176,7 @@ def _salience(levels: Levels, first: int, last: int, guard: int, length: int, ri
     peak = rising[:-1] > rising[1:]
     score[1:-1] += (peak.view(np.int8) - np.int8(1)) * BARRED  # a sum: choices that nothing foretells are slow
     score = score.reshape(-1, width)[:, lead + 1 : lead + last - first - 1].copy()
-    score += np.tile(rise[1:-1], (len(score), 1))
+    score += np.tile(rise, (len(score), 1))
     return score
 
 
@@ -187,79 +190,108 @@ def _columns(values: Floats, first: int, last: int) -> Floats:
     return columns
 
 
-def _highest(score: Floats) -> npt.NDArray[np.int64]:
-    """Columns (n, CANDIDATES) of the highest scores of each row, -1 where there are no more. `score` is used up."""
+def _highest(score: Floats, first: int) -> npt.NDArray[np.int64]:
+    """Columns (n, CANDIDATES), counted from `first`, of the highest scores of each row; -1 pads. `score` is used up."""
     flat, start = score.reshape(-1), np.arange(0, score.size, score.shape[1])
     best = np.empty((CANDIDATES, len(score)), dtype=np.int64)
     heights = np.empty((CANDIDATES, len(score)), dtype=np.float32)
     for rank in range(CANDIDATES):  # a few passes of argmax cost less than sorting every line
-        score.argmax(axis=1, out=best[rank])
-        at = best[rank] + start
+        at = score.argmax(axis=1) + start
+        best[rank] = at
         heights[rank] = flat[at]
         flat[at] = -np.inf
+    best -= start - first
     best[heights < -BARRED / 2] = -1
     return best.T
 
 
 def find_candidates(
-    envelopes: Envelopes,
-    magnitude: Floats,
-    levels: Levels,
-    skin_s: Array,
-    window_s: tuple[float, float],
-    transducer_hz: float,
+    envelopes: Envelopes, magnitude: Floats, skin_s: Array, window_s: tuple[float, float], transducer_hz: float
 ) -> Candidates:
     """The most salient echoes within `window_s` (least, most) behind the skin echo of each line.
 
     The search runs over the window common to all lines of the batch (the skin moves by a few samples only).
     """
-    noise = noise_level(levels)
-    rate = envelopes.rate_hz
-    skin = float(np.median(skin_s)) if len(skin_s) else 0.0
+    rate, (count, length) = envelopes.rate_hz, magnitude.shape
+    skin = median(skin_s) if count else 0.0
     first = max(int((skin + window_s[0]) * rate), 0)
-    last = min(int((skin + window_s[1]) * rate) + 1, magnitude.shape[1])
-    if last - first < 6:
-        return _none(len(magnitude), noise)
+    last = min(int((skin + window_s[1]) * rate) + 1, length)
     rise = TYPICAL_ATTENUATION * transducer_hz * 1e-6 * 154e3  # dB a second of delay: 77 km/s of depth, both ways, per cm
-    samples = salient_peaks(levels, rate, rise, first, last, SALIENCE_GUARD_CYCLES / transducer_hz)
-    positions, heights, widths = fit_tops(magnitude, samples)
-    rows = np.arange(len(samples))[:, None]
-    complex_values = envelopes.values[rows, np.clip(samples, 0, None)]
+    levels = Levels(np.empty((count, padded(length)), dtype=np.float32), length)
+    samples = np.empty((CANDIDATES, count), dtype=np.int64)
+    for start in range(0, count, ROWS):
+        rows = slice(start, start + ROWS)
+        log = logarithm(magnitude[rows])
+        some = take_levels(log, length, levels.sums[rows])
+        if last - first >= 6:
+            samples[:, rows] = salient_peaks(log, some, rate, rise, first, last, SALIENCE_GUARD_CYCLES / transducer_hz).T
+    if last - first < 6:
+        return _none(count, noise_level(levels))
+    return _describe(envelopes, magnitude, levels, samples.T, skin_s, int(skin * rate), transducer_hz)
+
+
+def _describe(
+    envelopes: Envelopes,
+    magnitude: Floats,
+    levels: Levels,
+    samples: npt.NDArray[np.int64],
+    skin_s: Array,
+    skin_sample: int,
+    transducer_hz: float,
+) -> Candidates:
+    """What speaks for and against the echoes at `samples` (n, K)."""
+    rate, noise = envelopes.rate_hz, noise_level(levels)
+    positions, heights, widths = (values.T for values in fit_tops(magnitude, samples))
+    number = samples.T
+    back, here, ahead = _at(envelopes.values, clip(number + _STEPS, 0, magnitude.shape[1] - 1))
+    times = positions / rate
     # the baseband phase hardly changes within a sample; the carrier's phase is that of the refined time
-    phases = np.angle(complex_values) + 2 * np.pi * envelopes.carrier_hz * (positions / rate)
-    ahead, back = (envelopes.values[rows, np.clip(samples + k, 0, magnitude.shape[1] - 1)] for k in (1, -1))
-    turn = np.angle(ahead * back.conj())
-    guard, near, reach = (int(x * rate) for x in (GUARD_CYCLES / transducer_hz, NEAR_S, SALIENCE_S))
-    inner, outer = (max(round(x * rate / transducer_hz), 1) for x in FOOT_CYCLES)
-    skin_sample = np.full_like(samples, int(skin * rate) + guard)
-    end = np.full_like(samples, magnitude.shape[1])
-    around, before, after, before_all, after_all, front, rear, last_level = levels.means(
-        (samples - reach, samples + reach + 1),
-        (np.maximum(samples - guard - near, skin_sample), samples - guard),
-        (samples + guard, samples + guard + near),
-        (skin_sample, samples - guard),
-        (samples + guard, end),
-        (samples - outer, samples - inner),
-        (samples + inner + 1, samples + outer + 1),
-        (end - guard * 4, end),
-    )
-    base, height = np.log(noise)[:, None] + LOG_RAYLEIGH, np.log(heights)
+    phases = np.angle(here) + 2 * np.pi * envelopes.carrier_hz * times
+    frequencies = envelopes.carrier_hz + np.angle(ahead * back.conj()) * (rate / (4 * np.pi))
+    frequencies[number < 0] = np.nan
+    height, base = np.log(heights), np.log(noise) + LOG_RAYLEIGH
+    mean = _surroundings(levels, number, rate, transducer_hz, skin_sample)
+    over, under = DECIBEL * (height - mean[:3]), DECIBEL * (mean[3:] - base)
     return Candidates(
-        delays_s=positions / rate - skin_s[:, None],
-        amplitudes=heights,
-        phases=phases,
-        widths_s=widths / rate,
-        frequencies_hz=np.where(samples < 0, np.nan, envelopes.carrier_hz + turn * rate / (4 * np.pi)),
-        saliences_db=DECIBEL * (height - around),
-        before_db=DECIBEL * (before - base),
-        after_db=DECIBEL * (after - base),
-        before_all_db=DECIBEL * (before_all - base),
-        after_all_db=DECIBEL * (after_all - base),
-        rise_db=DECIBEL * (height - front),
-        fall_db=DECIBEL * (height - rear),
-        end_db=DECIBEL * (last_level - base),
+        delays_s=(times - skin_s).T,
+        amplitudes=heights.T,
+        phases=phases.T,
+        widths_s=(widths / rate).T,
+        frequencies_hz=frequencies.T,
+        saliences_db=over[0].T,
+        rise_db=over[1].T,
+        fall_db=over[2].T,
+        before_db=under[0].T,
+        after_db=under[1].T,
+        before_all_db=under[2].T,
+        after_all_db=under[3].T,
+        end_db=under[4].T,
         noise=noise,
     )
+
+
+def _surroundings(
+    levels: Levels, number: npt.NDArray[np.int64], rate_hz: float, transducer_hz: float, skin_sample: int
+) -> Floats:
+    """Mean logarithm (8, K, n) around the samples `number` (K, n), at the front and the rear foot, just before and behind, in
+    all before and all behind, and at the line's end."""
+    guard, near, reach = (int(x * rate_hz) for x in (GUARD_CYCLES / transducer_hz, NEAR_S, SALIENCE_S))
+    inner, outer = (max(round(x * rate_hz / transducer_hz), 1) for x in FOOT_CYCLES)
+    skin = skin_sample + guard
+    stretches = np.empty((2, 8, *number.shape), dtype=np.int64)
+    first, last = stretches
+    for row, least, most in (
+        (0, number - reach, number + (reach + 1)),
+        (1, number - outer, number - inner),
+        (2, number + (inner + 1), number + (outer + 1)),
+        (3, np.maximum(number - (guard + near), skin), number - guard),
+        (4, number + guard, number + (guard + near)),
+        (5, skin, number - guard),
+        (6, number + guard, levels.length),
+        (7, levels.length - 4 * guard, levels.length),
+    ):
+        first[row], last[row] = least, most
+    return levels.mean(first, last)
 
 
 def _none(count: int, noise: Array) -> Candidates:
@@ -276,7 +308,6 @@ def concatenate(parts: list[Candidates]) -> Candidates:
 
 def reorder(candidates: Candidates, order: npt.NDArray[np.int64]) -> Candidates:
     """The candidates of each line in another order, indices (n, K)."""
+    at = order.T * len(order) + np.arange(len(order))
     values = {name: getattr(candidates, name) for name in Candidates.__dataclass_fields__}
-    return Candidates(
-        **{name: np.take_along_axis(value, order, axis=1) if value.ndim == 2 else value for name, value in values.items()}
-    )
+    return Candidates(**{name: value.T.reshape(-1).take(at).T if value.ndim == 2 else value for name, value in values.items()})

@@ -12,9 +12,10 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Acquisition, Recording
 
-from ModuleUltrasoundLib.echo_candidates import Candidates, concatenate, find_candidates, reorder, rough_noise, take_levels
+from ModuleUltrasoundLib.echo_candidates import Candidates, concatenate, find_candidates, reorder, rough_noise
 from ModuleUltrasoundLib.echo_features import line_features
 from ModuleUltrasoundLib.echo_timing import BEFORE, BEHIND, Complexes
+from ModuleUltrasoundLib.lean import pick
 from ModuleUltrasoundLib.signal_chain import Band, Envelopes, check_acquisition, complex_envelopes, design_band
 from ModuleUltrasoundLib.signal_forerun import Forerun, find_forerun, nominal_skin_s, steady, suppress_multiples
 
@@ -129,14 +130,12 @@ def _search_batch(lines: npt.NDArray[np.int16], search: Search) -> Found:
     forerun = find_forerun(envelopes, magnitude, rough_noise(magnitude), acquisition)
     if search.several_spots and skin > 0:
         suppress_multiples(envelopes, magnitude, forerun, acquisition)
-    levels = take_levels(magnitude)
-    candidates = find_candidates(envelopes, magnitude, levels, forerun.skin_s, search.window_s, acquisition.transducer_hz)
+    candidates = find_candidates(envelopes, magnitude, forerun.skin_s, search.window_s, acquisition.transducer_hz)
     features = line_features(candidates, forerun, skin, acquisition.transducer_hz, search.speed_m_s)
     scores = np.zeros(features.shape[:2]) if rank is None else rank(features)
     if rank is not None:
         order = np.argsort(-np.where(np.isfinite(candidates.delays_s), scores, -np.inf), axis=1, kind="stable")
-        candidates, scores = reorder(candidates, order), np.take_along_axis(scores, order, axis=1)
-        features = np.take_along_axis(features, order[..., None], axis=1)
+        candidates, scores, features = reorder(candidates, order), pick(scores, order), pick(features, order)
     return Found(
         candidates,
         forerun,

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 from ModuleUltrasoundLib.echo_candidates import (
     CANDIDATES,
     find_candidates,
+    logarithm,
     noise_level,
     refine_peaks,
     rough_noise,
@@ -27,7 +28,7 @@ def bump(at, height, width=2.0, length=900):
 def test_noise_level_is_the_deviation_of_one_quadrature():
     magnitude = rayleigh(np.random.default_rng(0), 7.0)
     magnitude[:, 100:300] += 400  # tissue
-    assert np.median(noise_level(take_levels(magnitude))) == pytest.approx(7.0, rel=0.15)
+    assert np.median(noise_level(take_levels(logarithm(magnitude), 900))) == pytest.approx(7.0, rel=0.15)
     assert np.median(rough_noise(magnitude)) == pytest.approx(7.0, rel=0.15)
 
 
@@ -40,12 +41,23 @@ def test_parabola_through_the_logarithm_is_exact_for_a_gaussian(at, height, widt
     assert top[0, 0] == pytest.approx(height, rel=1e-3)
 
 
+def test_mean_level_of_any_stretch_is_that_of_the_logarithm():
+    rng = np.random.default_rng(4)
+    magnitude = rayleigh(rng, 5.0, (3, 901))
+    levels = take_levels(logarithm(magnitude), 901)
+    first, last = np.sort(rng.integers(0, 902, (2, 40, 3)), axis=0)
+    expected = [[np.log(magnitude[n, a:b] + 1e-3).mean() if b > a else np.nan for n, (a, b) in enumerate(zip(*row))]
+                for row in zip(first, last)]  # fmt: skip
+    assert levels.mean(first, last) == pytest.approx(np.array(expected), abs=1e-3, nan_ok=True)
+
+
 def test_faint_lone_echo_is_kept_beside_loud_tissue():
     rng = np.random.default_rng(1)
     magnitude = rayleigh(rng, 1.0, (20, 900))
     magnitude += (rayleigh(rng, 300.0, (20, 900)) * np.exp(-np.arange(900) / 60)).astype(np.float32)
     magnitude += bump(700, 15.0).astype(np.float32)
-    samples = salient_peaks(take_levels(magnitude), RATE, 1e6, 20, 800, 4e-7)
+    log = logarithm(magnitude)
+    samples = salient_peaks(log, take_levels(log, 900), RATE, 1e6, 20, 800, 4e-7)
     assert (np.abs(samples - 700) <= 2).any(axis=1).mean() > 0.95
 
 
@@ -56,7 +68,7 @@ def test_candidates_carry_their_time_phase_and_surroundings():
     noise = np.random.default_rng(2).normal(0, 0.5, (2, 900, 2)) @ [1, 1j]
     envelopes = Envelopes((values + noise).astype(np.complex64), RATE, carrier)
     magnitude = np.abs(envelopes.values)
-    found = find_candidates(envelopes, magnitude, take_levels(magnitude), np.full(2, 2e-6), (1e-6, 25e-6), 5e6)
+    found = find_candidates(envelopes, magnitude, np.full(2, 2e-6), (1e-6, 25e-6), 5e6)
     best = np.nanargmax(found.amplitudes, axis=1)
     assert found.delays_s[[0, 1], best] == pytest.approx(np.full(2, at / RATE - 2e-6), abs=6e-9)
     assert np.exp(1j * found.phases[[0, 1], best]) == pytest.approx(np.full(2, np.exp(0.7j)), abs=0.08)
@@ -68,6 +80,6 @@ def test_candidates_carry_their_time_phase_and_surroundings():
 def test_window_outside_of_the_line_gives_no_candidates():
     envelopes = Envelopes(np.ones((3, 50), dtype=np.complex64), RATE, 4.6e6)
     magnitude = np.abs(envelopes.values)
-    found = find_candidates(envelopes, magnitude, take_levels(magnitude), np.full(3, 1e-5), (1e-6, 2e-5), 5e6)
+    found = find_candidates(envelopes, magnitude, np.full(3, 1e-5), (1e-6, 2e-5), 5e6)
     assert found.delays_s.shape == (3, CANDIDATES)
     assert np.isnan(found.delays_s).all()

@@ -1,0 +1,38 @@
+"""A few numpy calls written for small arrays.
+
+One A-line alone passes through hundreds of calls on arrays of eight numbers. There numpy's own `clip`, `median`, `nan_to_num` and
+`take_along_axis` spend 3 to 15 microseconds each on what they check; these spend one or two.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+Number = TypeVar("Number", bound="np.number[Any]")
+Real = TypeVar("Real", bound="np.floating[Any]")
+Scalar = TypeVar("Scalar", bound="np.generic")
+
+
+def clip(values: npt.NDArray[Number], least: float, most: float) -> npt.NDArray[Number]:
+    """Values between `least` and `most`; what is not a number stays so."""
+    return np.asarray(np.minimum(np.maximum(values, least), most))
+
+
+def without_nan(values: npt.NDArray[Real], instead: float = 0.0) -> npt.NDArray[Real]:
+    """Values, with `instead` where they are not a number. Infinite ones stay."""
+    return np.asarray(np.where(np.isnan(values), values.dtype.type(instead), values))
+
+
+def median(values: npt.NDArray[np.floating[Any]]) -> float:
+    """Median of values (n,), n >= 1, all of them numbers."""
+    ordered = np.sort(values)
+    count = len(ordered)
+    return 0.5 * (float(ordered[(count - 1) // 2]) + float(ordered[count // 2]))
+
+
+def pick(values: npt.NDArray[Scalar], index: npt.NDArray[np.int64]) -> npt.NDArray[Scalar]:
+    """The columns `index` (n, K) of each row of values (n, M, ...)."""
+    return np.asarray(values[np.arange(len(values))[:, None], index])

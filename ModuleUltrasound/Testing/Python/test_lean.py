@@ -1,0 +1,24 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from ModuleUltrasoundLib.lean import clip, median, pick, without_nan
+
+NUMBERS = arrays(float, st.integers(1, 9), elements=st.floats(-1e6, 1e6))
+
+
+@settings(max_examples=50, deadline=None)
+@given(NUMBERS)
+def test_lean_calls_give_what_numpy_gives(values):
+    assert median(values) == pytest.approx(np.median(values))
+    assert clip(values, -2.0, 3.0).tolist() == np.clip(values, -2, 3).tolist()
+    values[0] = np.nan
+    assert without_nan(values, 5.0).tolist() == np.nan_to_num(values, nan=5.0).tolist()
+    assert np.isnan(clip(values, 0.0, 1.0)[0])
+
+
+def test_columns_are_picked_from_each_row():
+    rng = np.random.default_rng(0)
+    values, index = rng.normal(size=(5, 7)), rng.integers(0, 7, (5, 3))
+    assert pick(values, index).tolist() == np.take_along_axis(values, index, axis=1).tolist()
