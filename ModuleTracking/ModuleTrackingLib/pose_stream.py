@@ -84,6 +84,7 @@ class PoseStream(DeviceStream):
         self._arrivals: deque[float] = deque()
         self._frames = self._dropped = self._reconnections = 0
         self._news = threading.Event()
+        self.on_news: Callable[[], object] = bool  # called in the device's thread when there is something for `poll`
 
     # -- the main thread's side -------------------------------------------------------------------------------------
 
@@ -228,6 +229,7 @@ class PoseStream(DeviceStream):
                     self._dropped += 1
             self._queue.append(event)
             self._news.set()
+        self.on_news()
 
     def _opened(self, again: bool) -> None:
         self.tools = list(self.tracker.tools)

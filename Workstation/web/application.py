@@ -30,7 +30,7 @@ from Workstation.web.session_folder import SessionFolder, new_folder
 from Workstation.web.session_panel import SessionLogic
 from Workstation.web.session_windows import Windows
 from Workstation.web.sharpness import Sharpness, resize_slice
-from Workstation.web.sounds import Cues, situation
+from Workstation.web.sounds import Cues, TiltTone, situation
 from Workstation.web.tool_models import registered
 from Workstation.web.view_controls import ViewControls, layout_grid
 from Workstation.web.view_frame import SliceSliders
@@ -71,12 +71,13 @@ class WorkstationApp(TrameApp):
                 self.server, model, key, self.places.shown, self.places.meant, self.places.typed, self._poll
             )
         self._place: tuple[Any, ...] = ()  # that the slices show
-        self._moved_s, self._sharpness = 0.0, Sharpness(self._sharpen)
+        self._moves, self._moved_s, self._sharpness = False, 0.0, Sharpness(self._sharpen)
         self._in_turn = itertools.cycle(self.panels)  # of panels that are not shown, one at a time is looked at
         self._use_folder()
-        self.views, self.cues = ViewFollower(self.slicer, self.runner.start), Cues()
+        self.views, self.cues, self.tilt = ViewFollower(self.slicer, self.runner.start), Cues(), TiltTone()
         self.controls = ViewControls(self.server, self.layouts, self.views.fit)
         self.server.state.legend, self.server.state.cue, self.server.state.muted = None, {}, False
+        self.server.state.tilt = self.tilt.next(None)
         self.server.state.live = drawings(self.logics[ULTRASOUND])
         self.server.state.files, self.server.state.simulated = [], False
         self.files = FilesDialog(self.server, self.places, self._load_ct, self.runner.start)
@@ -106,6 +107,7 @@ class WorkstationApp(TrameApp):
 
         from Workstation.web.moving import MovingPicture
         from Workstation.web.pacing import Painter, pace, register_quiet_factories
+        from Workstation.web.slicing import SlicePicture
 
         self.slicer = SlicerApp()
         host.adopt_scene(self.slicer.scene, self.slicer.app_logic)
@@ -118,7 +120,8 @@ class WorkstationApp(TrameApp):
         self.painter.before_round = self._lead
         manager = self.slicer.view_manager
         for view in manager.get_slice_views():
-            pace(view, get_view_trame_id(self.server, view), self.painter, PICTURE_QUALITY)
+            cut = SlicePicture(view, lambda: self.views.sphere())
+            pace(view, get_view_trame_id(self.server, view), self.painter, PICTURE_QUALITY, cut)
         for view in manager.get_threed_views():
             still = MovingPicture(view, lambda: self.views.moving_models())
             pace(view, get_view_trame_id(self.server, view), self.painter, PICTURE_QUALITY, still)
@@ -144,9 +147,17 @@ class WorkstationApp(TrameApp):
 
     async def _keep_fresh(self, **_: Any) -> None:
         """Bring the devices' news into the scene, and the scene's into the panels."""
+        loop = asyncio.get_running_loop()
+
+        def tell() -> None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended before the device's thread
+                loop.call_soon_threadsafe(self._hear)
+
         for turn in itertools.count():
             await asyncio.sleep(POLL_S)
             self._poll()
+            if self.logics[TRACKING].stream is not None:
+                self.logics[TRACKING].stream.on_news = tell
             for part in (self._move, self._turn, self._keep):
                 try:
                     part(turn)
@@ -175,12 +186,24 @@ class WorkstationApp(TrameApp):
                 self.logics[name].poll()
         self.painter.muted = False
 
+    def _hear(self) -> None:
+        """A pose has come: its picture is begun now, and not when the devices are looked at next."""
+        if registered() and not self.painter.waits:
+            self._poll()
+            if self._followed() != self._place:
+                self._draw_moving()
+
     def _move(self, turn: int) -> None:
         """Hide lost tools; have the views drawn anew that follow the leading one."""
         self.views.show_tools(self._forerun_mm())
         place = self._followed()
         if place != self._place:
             self._draw_moving()
+
+    def _draw_slices(self) -> None:
+        """What stands still is Slicer's own picture."""
+        for view in self._slices.get_views():
+            view.schedule_render()
 
     def _draw_moving(self) -> None:
         with self.painter.while_moving():
@@ -208,7 +231,11 @@ class WorkstationApp(TrameApp):
     def _turn(self, turn: int) -> None:
         if turn % REFRESH_EVERY == 0:
             now_s = time.monotonic()
-            self._sharpness.look(now_s, self.painter.late_s, bool(self._place) and now_s < self._moved_s + STANDS_S)
+            moves = bool(self._place) and now_s < self._moved_s + STANDS_S
+            self._sharpness.look(now_s, self.painter.late_s, moves)
+            if self._moves and not moves:
+                self._draw_slices()
+            self._moves = moves
             with self.server.state as state:
                 self._refresh_views(state)
                 self.controls.look()
@@ -230,9 +257,10 @@ class WorkstationApp(TrameApp):
         """Views, legend and sounds as the open step needs them."""
         ultrasound = self.logics[ULTRASOUND]
         state.legend = self.views.refresh(state.step, state.error_shown, self._forerun_mm(), self._asked_for(state.step))
-        cue = self.cues.next(situation(self.panels, ultrasound, state.step == "ultrasound"))
+        cue = self.cues.next(situation(self.panels, ultrasound))
         if cue is not None:
             state.cue = cue
+        state.tilt = self.tilt.next(ultrasound.guide() if state.step == "ultrasound" else None)
 
     def _asked_for(self, step: str) -> str:
         """The point that the open step asks for; "" if none."""

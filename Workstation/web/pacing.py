@@ -6,7 +6,6 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
@@ -17,7 +16,7 @@ from trame_slicer.views import ScheduledRenderStrategy, SliceView, ThreeDView, V
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonDataModel import vtkImageData
 
-from Workstation.web.pictures import Picture, Pictures, encoded
+from Workstation.web.pictures import Pictures, encoded
 from Workstation.web.view_frame import SliceSliders, slice_frame, threed_frame
 
 FASTEST_S = 1 / 25  # between two rounds; what is left of the machine is the browser's
@@ -57,6 +56,11 @@ class Painter:
         self.pictures.outdated(name)
         self.wake()
 
+    @property
+    def waits(self) -> bool:
+        """Whether a round is to come: it will bring in what is new by itself."""
+        return bool(self._wanted)
+
     def wake(self) -> None:
         """Something may have become possible."""
         if self._news is not None:
@@ -86,7 +90,7 @@ class Painter:
         return [name for name, view in self._wanted.items() if self._takes(view)]
 
     def _takes(self, view: PacedRendering) -> bool:
-        return not view.encoding and self.pictures.takes(view.name)
+        return self.pictures.takes(view.name)
 
     def _soon(self) -> bool:
         """Whether a view that was painted just now will take another picture in a moment: then all are painted together."""
@@ -116,13 +120,14 @@ class WindowPicture:
 
 
 class PacedRendering(ScheduledRenderStrategy):  # type: ignore[misc]
-    """A view's requests go to the painter; `source` draws its picture, which is encoded in a thread and then sent."""
+    """A view's requests go to the painter; `source` draws its picture, which is encoded and on its way before the next one.
 
-    encoders = ThreadPoolExecutor(2, "cranionav-encode")
+    It is encoded here and not in a thread: that one would have to wait until the next view has been drawn.
+    """
 
     def __init__(self, name: str, source: Any, painter: Painter, quality: int) -> None:
         super().__init__()
-        self.source, self.encoding, self.painted_s = source, False, 0.0
+        self.source, self.painted_s = source, 0.0
         self.name, self._painter, self._quality = name, painter, quality
 
     def schedule_render(self) -> None:
@@ -134,18 +139,10 @@ class PacedRendering(ScheduledRenderStrategy):  # type: ignore[misc]
         self._painter.ask(self.name, self)
 
     def paint(self) -> None:
-        """Draw, and have the picture encoded and sent. In the event loop."""
+        """Draw, encode, and offer to the windows. In the event loop."""
         picture, self.painted_s = self._painter.pictures.begun(self.name), time.monotonic()
-        pixels = self.source.draw()
-        self.encoding = True
-        work = asyncio.get_running_loop().run_in_executor(self.encoders, encoded, pixels, self._quality)
-        work.add_done_callback(partial(self._send, picture))
-
-    def _send(self, picture: Picture, work: asyncio.Future[bytes]) -> None:
-        self.encoding = False
-        picture.content = work.result()
+        picture.content = encoded(self.source.draw(), self._quality)
         self._painter.pictures.offer(picture)
-        self._painter.wake()
 
 
 def pixels_of(window: Any) -> Any:

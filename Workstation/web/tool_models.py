@@ -47,11 +47,12 @@ class ToolModels:
 
 
 class ErrorRing:
-    """A sphere of the 95% error about the tip; the slices cut it in a ring. It is moved and sized by a transform."""
+    """A sphere of the 95% error about the tip, moved and sized by a transform; slicing.py draws where a slice cuts it."""
 
     def __init__(self) -> None:
         self._node: Any = None
         self._place: Any = None
+        self.sphere: tuple[Any, float] | None = None  # its middle (3,) in RAS and its radius, mm
 
     def nodes(self) -> list[Any]:
         """The ring's node, if there is one."""
@@ -70,13 +71,12 @@ class ErrorRing:
         self._place.SetSaveWithScene(False)
         self._node = moving_model("Error ring", RING)
         self._node.GetDisplayNode().SetRepresentation(self._node.GetDisplayNode().WireframeRepresentation)
-        self._node.GetDisplayNode().SetVisibility2D(True)
-        self._node.GetDisplayNode().SetSliceIntersectionThickness(3)
         self._node.SetAndObservePolyData(source.GetOutput())
         self._node.SetAndObserveTransformNodeID(self._place.GetID())
 
     def show(self, tip_ras_mm: Any, radius_mm: float | None) -> None:
         """Move and size it; without a radius it is hidden."""
+        self.sphere = (np.asarray(tip_ras_mm, dtype=float), radius_mm) if radius_mm is not None else None
         if self._node is not None and self._node.GetScene() is None:
             self._node = None
         if radius_mm is None:

@@ -39,9 +39,6 @@ class ViewFollower:
         if self._bone.refresh():
             self._framing.fit()
         self._skin.refresh()
-        outer = scene.find("OuterTable")
-        if outer is not None and outer.GetDisplayNode().GetVisibility():
-            outer.GetDisplayNode().SetVisibility(False)  # it lies on Bone: drawing both shows nothing more
         legend = self._errors.refresh(self._bone.node, error_shown if step in WITH_ERROR else "")
         self._points.refresh(step, legend is not None and error_shown == RESIDUALS, asked_for)
         self.show_tools(forerun_mm)
@@ -75,6 +72,10 @@ class ViewFollower:
     def moving_models(self) -> list[Any]:
         """Nodes of what moves with every pose."""
         return [*self._tools.nodes(), *self._ring.nodes()]
+
+    def sphere(self) -> tuple[Any, float] | None:
+        """Middle (3,) in RAS and radius in mm of what the ring is cut from; None without one."""
+        return self._ring.sphere
 
     def ring(self, tip_ras_mm: Any, radius_mm: float | None) -> None:
         """The 95% error about a point; without a radius none."""
