@@ -2,9 +2,27 @@
 
 from __future__ import annotations
 
-import pytest
+import importlib.util
+import itertools
+import sys
+from pathlib import Path
+from types import SimpleNamespace
 
-from Workstation.web.sounds import Cues, Situation, pitch_of
+import numpy as np
+import pytest
+from ModuleUltrasoundLib.guidance import cue
+
+from Workstation.web.sounds import Cues, Situation, TiltTone
+from Workstation.web.sounds_view import PLAY
+
+if "workstation_user" not in sys.modules:
+    _SPEC = importlib.util.spec_from_file_location("workstation_user", Path(__file__).with_name("workstation_user.py"))
+    assert _SPEC is not None
+    assert _SPEC.loader is not None
+    sys.modules["workstation_user"] = importlib.util.module_from_spec(_SPEC)
+    _SPEC.loader.exec_module(sys.modules["workstation_user"])
+BROWSER = sys.modules["workstation_user"].BROWSER
+needs_browser = pytest.mark.skipif(not Path(BROWSER).exists(), reason="no Chromium on this machine")
 
 
 def heard(*moments: Situation) -> list[str]:
@@ -30,12 +48,103 @@ def test_the_same_refusal_is_heard_once_and_a_second_of_the_same_words_again():
 
 def test_each_cue_has_a_number_of_its_own():
     cues = Cues()
-    numbers = [cues.next(Situation(tilt_deg=5.0)) for _ in range(4)][1:]
+    numbers = [cues.next(Situation(taken)) for taken in range(4)][1:]
     assert [one["count"] for one in numbers] == [1, 2, 3]
 
 
-def test_the_pitch_rises_towards_upright():
-    pitches = [pitch_of(tilt) for tilt in (60, 20, 10, 5, 0)]
-    assert pitches == sorted(pitches)
-    assert pitch_of(0) == pytest.approx(2 * pitch_of(10))
-    assert pitch_of(-10) == pitch_of(10)
+def guide_at(angle_deg: float, on_target: bool = True) -> SimpleNamespace:
+    return SimpleNamespace(cue=cue(angle_deg), on_target=on_target)
+
+
+def test_the_tilts_tone_is_the_guides_own_and_falls_silent_off_the_point():
+    tone = TiltTone()
+    told = [tone.next(guide_at(angle)) for angle in (15.0, 15.0, 5.0, 1.0)]
+    assert [one["count"] for one in told] == [1, 2, 3, 4], "the page hears that the tilt is still known"
+    assert told[0]["rate"] < told[2]["rate"]
+    assert told[0]["pitch"] < told[2]["pitch"] < told[3]["pitch"]
+    assert told[3]["rate"] == 0.0, "square: a steady tone"
+    silent = {"rate": 0.0, "pitch": 0.0, "count": 0}
+    assert tone.next(guide_at(1.0, on_target=False)) == tone.next(None) == silent
+
+
+RATE_HZ = 16000  # Hz, of the sound that is calculated
+
+
+@pytest.fixture(scope="module")
+def rendered():
+    """What the page's instrument plays, calculated by a browser: samples of a piece of JavaScript that plays on `it`."""
+    from playwright.sync_api import sync_playwright
+
+    script = """async ([play, seconds, rate]) => {
+      const context = new OfflineAudioContext(1, seconds * rate, rate), it = window.cranionavSounds.instrument(context);
+      new Function('it', 'context', play)(it, context);
+      return Array.from((await context.startRendering()).getChannelData(0));
+    }"""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=BROWSER, args=sys.modules["workstation_user"].FLAGS.split())
+        page = browser.new_page()
+        page.evaluate(PLAY)
+        yield lambda play, seconds=0.8: np.array(page.evaluate(script, [play, seconds, RATE_HZ]))
+        browser.close()
+
+
+def tones(samples: np.ndarray) -> list[tuple[float, float, float]]:
+    """(beginning in s, length in s, strongest frequency in Hz) of each stretch that sounds."""
+    loud = np.convolve(np.abs(samples), np.ones(80) / 80, "same") > 0.01
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], loud.astype(int), [0]])))
+    found = []
+    for first, end in zip(edges[::2], edges[1::2], strict=True):
+        spectrum = np.abs(np.fft.rfft(samples[first:end] * np.hanning(end - first), 8 * RATE_HZ))
+        found.append((first / RATE_HZ, (end - first) / RATE_HZ, float(np.argmax(spectrum)) / 8))
+    return found
+
+
+def loudness_db(samples: np.ndarray) -> float:
+    """Level as the ear weighs it (IEC 61672, A), of what sounds, below full scale."""
+    spectrum, hertz = np.fft.rfft(samples), np.fft.rfftfreq(len(samples), 1 / RATE_HZ)
+    f2 = hertz**2
+    weight = 1.2589 * 12194**2 * f2**2 / ((f2 + 20.6**2) * np.sqrt((f2 + 107.7**2) * (f2 + 737.9**2)) * (f2 + 12194**2))
+    weighed = np.fft.irfft(spectrum * weight)
+    sounding = sum(length for _, length, _ in tones(samples)) * RATE_HZ
+    return float(10 * np.log10(np.sum(weighed**2) / sounding))
+
+
+@needs_browser
+@pytest.mark.slow
+def test_the_cues_differ_in_number_and_pitch_are_about_as_loud_and_none_is_clipped(rendered):
+    played = {name: rendered(f"it.cue('{name}', 0.1)") for name in ("taken", "refused", "lost")}
+    pitches = {name: [round(hertz) for *_, hertz in tones(samples)] for name, samples in played.items()}
+    assert pitches["taken"] == pytest.approx([880, 1320], rel=0.02)
+    assert pitches["refused"] == pytest.approx([311, 233], rel=0.02)
+    assert pitches["lost"] == pytest.approx([660, 520, 390], rel=0.02)
+    levels = {name: loudness_db(samples) for name, samples in played.items()}
+    assert max(levels.values()) - min(levels.values()) < 6, levels
+    assert min(levels.values()) > -25, levels
+    for first, second in itertools.combinations(played, 2):
+        together = rendered(f"it.cue('{first}', 0); it.cue('{second}', 0); it.tilt(0, 880, 0, 1)")
+        assert np.abs(together).max() < 1.0, "clipped"
+    assert max(length for samples in played.values() for _, length, _ in tones(samples)) < 0.35
+
+
+@needs_browser
+@pytest.mark.slow
+def test_the_beeps_of_the_tilt_quicken_and_rise_and_become_one_steady_tone(rendered):
+    heard_of = {}
+    for angle in (25.0, 12.0, 6.0, 2.5):
+        wanted = cue(angle)
+        call = f"for (let k = 0; k < 60; k++) it.tilt({wanted.rate_hz}, {wanted.pitch_hz}, k / 20, k / 20 + 0.15)"  # every 50 ms
+        found = tones(rendered(call, 3.0))
+        assert np.diff([begin for begin, *_ in found]) == pytest.approx(1 / wanted.rate_hz, abs=0.004)
+        assert np.array([hertz for *_, hertz in found]) == pytest.approx(wanted.pitch_hz, rel=0.03)
+        heard_of[angle] = len(found)
+    assert sorted(heard_of.values()) == list(heard_of.values()), "the nearer to square, the more"
+    steady = tones(rendered("for (let k = 0; k < 20; k++) it.tilt(0, 880, k / 20, k / 20 + 0.15); it.tilt(0, 0, 1, 1.15)", 2.0))
+    assert [(round(begin, 1), round(length, 1), round(hertz)) for begin, length, hertz in steady] == [(0.0, 1.0, 880)]
+
+
+@needs_browser
+@pytest.mark.slow
+def test_what_is_muted_falls_silent_at_once_in_the_middle_of_a_tone(rendered):
+    muted = rendered("it.tilt(0, 880, 0, 1); context.suspend(0.5).then(() => { it.mute(true); context.resume(); })")
+    assert np.abs(muted[: RATE_HZ // 2]).max() == pytest.approx(0.1, rel=0.05)
+    assert np.abs(muted[int(0.6 * RATE_HZ) :]).max() < 1e-4

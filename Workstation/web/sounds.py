@@ -10,7 +10,6 @@ from CranioNavLib.panel import Level
 
 TOUCHED = ("LandmarksPatient", "TargetsPatient", "PlausibilityPoints")
 TOOLS = ("Stylus", "Probe", "Sphere")
-UPRIGHT_HZ, OCTAVE_DEG, LOWEST_HZ = 880.0, 10.0, 110.0  # of the tilt's tone: an octave lower for each so many degrees
 
 
 @dataclass(frozen=True)
@@ -20,7 +19,6 @@ class Situation:
     taken: int = 0  # points
     refusals: tuple[object, ...] = ()  # the panels' messages that say no, each an object of its own
     tools: frozenset[str] = frozenset()  # in view
-    tilt_deg: float | None = None  # of the probe on its point
 
 
 class Cues:
@@ -31,7 +29,7 @@ class Cues:
         self._count = 0
 
     def next(self, now: Situation) -> dict[str, Any] | None:
-        """The cue to play: its name, a running number and (tilt) a pitch in Hz; None: silence. The gravest goes first."""
+        """The cue to play: its name and a running number; None: silence. The gravest goes first."""
         before, self._before = self._before, now
         if before is None:
             return None
@@ -41,25 +39,30 @@ class Cues:
             return self._cue("refused")
         if now.taken == before.taken + 1:  # more at once are loaded, not touched
             return self._cue("taken")
-        if now.tilt_deg is not None:
-            return self._cue("tilt", pitch_of(now.tilt_deg))
         return None
 
-    def _cue(self, name: str, pitch_hz: float = 0.0) -> dict[str, Any]:
+    def _cue(self, name: str) -> dict[str, Any]:
         self._count += 1
-        return {"name": name, "count": self._count, "pitch": round(pitch_hz)}
+        return {"name": name, "count": self._count}
 
 
-def pitch_of(tilt_deg: float) -> float:
-    """The tone of a tilt: the higher the nearer to upright."""
-    return max(LOWEST_HZ, UPRIGHT_HZ * float(2.0 ** (-abs(tilt_deg) / OCTAVE_DEG)))
+class TiltTone:
+    """What is heard of the probe's tilt while it stands on its point: beeps that quicken, a steady tone when it is square."""
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def next(self, guide: Any) -> dict[str, Any]:
+        """Beeps a second (0: a steady tone), pitch in Hz (0: silence), and a running number, without which the page is silent."""
+        self._count += 1
+        if guide is None or not guide.on_target:
+            return {"rate": 0.0, "pitch": 0.0, "count": 0}
+        return {"rate": round(guide.cue.rate_hz, 2), "pitch": round(guide.cue.pitch_hz), "count": self._count}
 
 
-def situation(panels: dict[str, Any], ultrasound: Any, palpating: bool) -> Situation:
-    """The present moment; `palpating`: whether the probe's tilt is to be heard."""
+def situation(panels: dict[str, Any], ultrasound: Any) -> Situation:
+    """The present moment."""
     counts = [node.GetNumberOfControlPoints() for node in map(scene.find, TOUCHED) if node is not None]
     refusals = tuple(panel.model.message for panel in panels.values() if panel.model.message.level is Level.BAD)
     tools = frozenset(tool for tool in TOOLS if scene_data.get_pose(f"{tool}ToReference").matrix is not None)
-    guide = ultrasound.guide() if palpating else None
-    tilt = float(guide.angle_deg) if guide is not None and guide.on_target else None
-    return Situation(sum(counts) + len(ultrasound.taken()), refusals, tools, tilt)
+    return Situation(sum(counts) + len(ultrasound.taken()), refusals, tools)
