@@ -43,6 +43,13 @@ html { overflow: hidden; }
 .headline .v-alert { border-radius: 4px; }
 .v-messages__message { line-height: 1.3; }
 .said { overflow-wrap: anywhere; max-height: 7.5em; overflow-y: auto; }
+*:focus-visible { outline: 3px solid #ffd54f !important; outline-offset: 2px; }
+.v-list-item:focus-visible, .v-btn-group .v-btn:focus-visible, .remote-controlled-area:focus-visible,
+.v-expansion-panel-title:focus-visible, .v-card-text:focus-visible { outline-offset: -3px; }
+.v-field:has(:focus-visible), .v-selection-control__input:has(:focus-visible) {
+  outline: 3px solid #ffd54f; outline-offset: 4px; }
+.v-field :focus-visible, .v-selection-control__input :focus-visible, [tabindex="-1"]:focus-visible,
+.v-overlay__content:focus-visible { outline: none !important; }
 .part { border-top: 1px solid rgba(255, 255, 255, 0.12); padding-top: 12px; margin-top: 12px; }
 """
 
@@ -108,7 +115,7 @@ class Page:
         step, after = procedure[number - 1], procedure[number] if number < len(procedure) else None
         with (
             DivLayout(self.server, f"step_{step.name}"),
-            html.Div(classes="pa-4", raw_attrs=[f'data-panel="{step.name}"']),
+            html.Div(classes="pa-4", raw_attrs=[f'data-panel="{step.name}"', 'tabindex="-1"']),
         ):
             html.Div(f"{number}  {step.title}", classes="text-h6")
             with html.Div(classes="in-sight headline"):

@@ -11,14 +11,16 @@ from Workstation.web.view_controls import LAYOUTS, WINDOWS
 
 # (key, what it does) of what the keys of the page do in every step
 KEYS = (
+    (words.BRIGHT_KEY, words.BRIGHT),
+    ("N", words.STEP_ON),
+    ("B", words.STEP_BACK),
+    (words.TAB_KEYS, words.TAB),
     *((choice.key, words.LAYOUTS[name]) for name, choice in LAYOUTS.items()),
     ("W", words.NEXT_WINDOW.format(titles=", ".join(words.WINDOWS.values()).lower())),
     ("D", words.DRAG_WINDOW),
     ("R", words.RESET),
     ("E", words.ERROR_COLORS),
     ("M", words.SOUNDS),
-    ("N", words.STEP_ON),
-    ("B", words.STEP_BACK),
     (words.MOVE_KEYS, words.MOVE),
     ("?", words.SHOW_KEYS),
 )

@@ -46,6 +46,7 @@ class BoneStep(RegistrationStep):
         """Make a bone the scene's, with what its segmentation promises of it."""
         scene_data.set_surface("Bone", bone.closed)
         table = scene_data.set_surface("OuterTable", bone.outer_table)
+        table.GetDisplayNode().SetVisibility(False)  # it lies on Bone: drawn with it, both flicker
         promised = {POSITION_SD: bone.position_sd_mm, OFFSET_SD: bone.offset_sd_mm, THRESHOLD: bone.threshold_hu}
         for attribute, value in promised.items():
             table.SetAttribute(attribute, repr(float(value)))
