@@ -6,6 +6,8 @@ of sound in the tissue, and a common offset of depth (what is left of the pulse'
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import numpy.typing as npt
 from CranioNavLib.rigid import Array
@@ -25,6 +27,7 @@ def refracted_angle_deg(incidence_deg: npt.ArrayLike, from_speed_m_s: float, to_
         return np.asarray(np.degrees(np.arcsin(sine)))
 
 
+@lru_cache(maxsize=16)
 def bending_sd_deg(acquisition: Acquisition, speed_m_s: float) -> float:
     """SD of the beam's angle in the tissue that an oblique interface in front of it causes; 0 without a forerun."""
     if acquisition.forerun_length_mm <= 0:

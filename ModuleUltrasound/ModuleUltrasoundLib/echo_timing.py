@@ -13,6 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.rigid import Array
 
+from ModuleUltrasoundLib.lean import clip
+
 Complexes = npt.NDArray[np.complex64]
 
 BEFORE, BEHIND = 10, 16  # samples of an echo's window before and behind its peak (4 a cycle of the transducer)
@@ -47,15 +49,16 @@ class Timing:
 
 def shift_windows(windows: Complexes, offset: Array) -> Complexes:
     """Windows (n, W) moved earlier by `offset` (n,) samples, |offset| < 2, by cubic interpolation; the ends repeat."""
-    whole = np.floor(offset).astype(np.int64)
-    part = (offset - whole).astype(np.float32)[:, None]
-    length = windows.shape[1]
-    index = np.clip(whole[:, None] + np.arange(-1, length + 2), 0, length - 1)
-    near = np.take_along_axis(windows, index, axis=1)
-    a, b, c, d = near[:, :-3], near[:, 1:-2], near[:, 2:-1], near[:, 3:]
+    whole = np.floor(offset)
+    part = (offset - whole).astype(np.float32)
+    count, length = windows.shape
+    # the lines are the last axis inside: numpy's inner loops then run over many of them
+    index = clip(whole.astype(np.int64) + np.arange(-1, length + 2)[:, None], 0, length - 1)
+    near = windows.reshape(-1).take(index + np.arange(0, count * length, length))
+    a, b, c, d = near[:-3], near[1:-2], near[2:-1], near[3:]
     moved = (0.5 * part) * ((c - a) + part * ((2 * a - 5 * b + 4 * c - d) + part * (3 * (b - c) + d - a)))
     moved += b
-    return np.asarray(moved, dtype=np.complex64)
+    return np.asarray(moved.T, dtype=np.complex64)
 
 
 def learn_pulse(windows: Complexes, offset: Array, chance: Array, rate_hz: float, transducer_hz: float) -> Pulse:
@@ -68,8 +71,9 @@ def learn_pulse(windows: Complexes, offset: Array, chance: Array, rate_hz: float
     some = sure[:: max(len(sure) // 512, 1)]
     aligned = shift_windows(windows[some], offset[some])
     aligned = aligned / aligned[:, BEFORE : BEFORE + 1]
-    typical = np.median(aligned.real, axis=0) + 1j * np.median(aligned.imag, axis=0)
-    return Pulse(typical, rate_hz, len(sure), 0.0, np.inf)
+    ordered = np.sort(np.concatenate([aligned.real.T, aligned.imag.T]), axis=1)  # sort is faster than median on short rows
+    middle = (ordered[:, (len(some) - 1) // 2] + ordered[:, len(some) // 2]) / 2
+    return Pulse(middle[: aligned.shape[1]] + 1j * middle[aligned.shape[1] :], rate_hz, len(sure), 0.0, np.inf)
 
 
 def fit_echoes(windows: Complexes, offset: Array, pulse: Pulse) -> tuple[Array, Array, Array, Array, Array]:
@@ -79,21 +83,20 @@ def fit_echoes(windows: Complexes, offset: Array, pulse: Pulse) -> tuple[Array, 
     deviation (rad), and the misfit; each of shape (n,).
     """
     w = pulse.values[BEFORE - CORE : BEFORE + CORE + 1].astype(np.complex64)
-    slope = np.gradient(pulse.values)[BEFORE - CORE : BEFORE + CORE + 1].astype(np.complex64)
-    windows = windows[:, BEFORE - CORE - MARGIN : BEFORE + CORE + 1 + MARGIN]
+    slope = (pulse.values[BEFORE - CORE + 1 : BEFORE + CORE + 2] - pulse.values[BEFORE - CORE - 1 : BEFORE + CORE]) / 2
+    slope = slope.astype(np.complex64)
+    windows = np.ascontiguousarray(windows[:, BEFORE - CORE - MARGIN : BEFORE + CORE + 1 + MARGIN])
     core = slice(MARGIN, MARGIN + 2 * CORE + 1)
-    shift = np.zeros(len(windows))
-    amplitude: npt.NDArray[np.complexfloating] = np.zeros(len(windows), dtype=np.complex128)
-    gram = np.array([[np.vdot(w, w), np.vdot(w, slope)], [np.vdot(slope, w), np.vdot(slope, slope)]])
-    inverse = np.linalg.inv(gram.astype(np.complex128))
+    shift: Array = np.zeros(len(windows))
+    own, mixed, other = complex(np.vdot(w, w)), complex(np.vdot(w, slope)), complex(np.vdot(slope, slope))
+    inverse = np.array([[other, -mixed], [-mixed.conjugate(), own]]) / (own * other - abs(mixed) ** 2)
     both = np.stack([w.conj(), slope.conj()], axis=1)
     for _ in range(2):
-        y = shift_windows(windows, np.clip(offset + shift, -1.5, 1.5))[:, core]
-        coefficients = (y @ both) @ inverse.T
-        amplitude = np.asarray(coefficients[:, 0], dtype=np.complex128)
-        step = -(coefficients[:, 1] / np.where(amplitude == 0, 1, amplitude)).real
-        shift = np.clip(shift + np.clip(step, -0.5, 0.5), -1.0, 1.0)
-    y = shift_windows(windows, np.clip(offset + shift, -1.5, 1.5))[:, core]
+        y = shift_windows(windows, clip(offset + shift, -1.5, 1.5))[:, core]
+        amplitude, along = inverse @ (y @ both).T
+        amplitude[amplitude == 0] = 1
+        shift = clip(shift + clip(-(along / amplitude).real, -0.5, 0.5), -1.0, 1.0)
+    y = shift_windows(windows, clip(offset + shift, -1.5, 1.5))[:, core]
     amplitude = (y @ w.conj()) / np.vdot(w, w).real
     rest = (np.abs(y - amplitude[:, None] * w) ** 2).sum(axis=1)
     # neighbouring samples of the band-passed noise are alike: about half of them count (4 samples a cycle, 2 independent)

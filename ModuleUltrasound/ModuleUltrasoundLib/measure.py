@@ -17,6 +17,7 @@ from ModuleUltrasoundLib.echo_network import Likelihood, learnt
 from ModuleUltrasoundLib.echo_onset import pulse_delay
 from ModuleUltrasoundLib.echo_search import Found, search_lines
 from ModuleUltrasoundLib.echo_timing import time_echoes
+from ModuleUltrasoundLib.lean import without_nan
 from ModuleUltrasoundLib.measure_points import bone_points as bone_points
 from ModuleUltrasoundLib.quality import CLIPPED_SHARE, TOLERANCE_MM, choose, clipped_share, quality_of, reasons_of, unstable
 
@@ -75,6 +76,8 @@ def stays(recording: Recording) -> npt.NDArray[np.int64]:
 
 def several_spots(recording: Recording, runs: npt.NDArray[np.int64]) -> bool:
     """Whether the lines come from several places on the head: after a jump, or along a glide."""
+    if len(recording) < 2:
+        return False
     origin = recording.probe_to_reference[:, :3, 3]
     known = origin[np.isfinite(origin).all(axis=1)]
     strayed = len(known) > 1 and float(np.linalg.norm(known - np.median(known, axis=0), axis=1).max()) > SAME_SPOT_MM
@@ -115,15 +118,16 @@ def time_of(found: Found, best: npt.NDArray[np.int64], chance: Array, transducer
     """
     rows = np.arange(len(best))
     kept = best < found.windows.shape[1]
-    peaks = np.where(kept, (found.candidates.delays_s + found.forerun.skin_s[:, None])[rows, best], np.nan)
+    peaks = np.where(kept, found.candidates.delays_s[rows, best] + found.forerun.skin_s, np.nan)
     windows = found.windows[rows, np.minimum(best, found.windows.shape[1] - 1)]
     timing, pulse = time_echoes(
         windows, peaks, found.forerun_phases, chance[rows, best], found.rate_hz, found.carrier_hz, transducer_hz
     )
-    snr = 10 ** (found.candidates.snrs_db[rows, best] / 20)
+    snr = found.candidates.amplitudes[rows, best] / found.candidates.noise
     bound = found.candidates.widths_s[rows, best] / np.maximum(snr, 1.0)
-    late = np.where(found.forerun.measured, 0.0, pulse_delay(found.bang, pulse, transducer_hz))
-    return np.where(kept, np.nan_to_num(timing.shift_s), 0.0) - late, np.hypot(
+    measured = found.forerun.measured
+    late = np.where(measured, 0.0, 0.0 if measured.all() else pulse_delay(found.bang, pulse, transducer_hz))
+    return np.where(kept, without_nan(timing.shift_s), 0.0) - late, np.hypot(
         np.where(kept, np.maximum(timing.sd_s, bound / 2), bound), found.forerun.sd_s
     )
 
@@ -162,7 +166,7 @@ def assemble(
         clipped,
         unstable(recording, depth, good, runs),
         depth,
-        np.nan_to_num(found.candidates.snrs_db, nan=-np.inf).max(axis=1, initial=-np.inf),
+        np.fmax.reduce(found.candidates.snrs_db, axis=1, initial=-np.inf),
         15 * shared[rows, best, SHARED_NAMES.index("strength")],
         10 * shared[:, 0, SHARED_NAMES.index("contact")],
         chance[rows, best],

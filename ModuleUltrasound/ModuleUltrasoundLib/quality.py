@@ -8,6 +8,8 @@ import scipy
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Recording
 
+from ModuleUltrasoundLib.lean import clip, pick, without_nan
+
 Bools = npt.NDArray[np.bool_]
 
 TOLERANCE_MM = 0.5  # what "right" means
@@ -21,6 +23,7 @@ UNSTABLE_MM = 1.0  # off the neighbours' median along the beam, while the probe 
 STILL_MM = 2.0  # the probe rests: its origin moved less than this over the neighbours
 REACH = 5  # neighbours on each side
 LEAST_NEIGHBOURS = 4
+BLOCK = 32  # lines looked at together
 AGREEING = 0.7  # of the neighbours are near their median: otherwise they tell nothing of this frame
 
 
@@ -29,10 +32,10 @@ def choose(depth_mm: Array, chance: Array) -> npt.NDArray[np.int64]:
 
     A rough bone under a tilted beam, or the end of the tissue's speckle at it, shows as several echoes side by side.
     """
-    near = np.abs(depth_mm[:, :, None] - depth_mm[:, None, :]) < TOLERANCE_MM
-    together = (near * chance[:, None, :]).sum(axis=2)
-    best = together.max(axis=1, keepdims=True, initial=0.0)
-    return np.asarray(np.where(together > GROUP_SHARE * best, chance, -1.0).argmax(axis=1), dtype=np.int64)
+    depth, share = np.ascontiguousarray(depth_mm.T), np.ascontiguousarray(chance.T)  # the lines last: long inner loops
+    together = ((np.abs(depth[:, None] - depth) < TOLERANCE_MM) * share).sum(axis=1)
+    best = together.max(axis=0, initial=0.0)
+    return np.asarray(np.where(together > GROUP_SHARE * best, share, -1.0).argmax(axis=0), dtype=np.int64)
 
 
 def quality_of(depth_mm: Array, best: npt.NDArray[np.int64], chance: Array, depth_sd_mm: Array) -> Array:
@@ -42,13 +45,16 @@ def quality_of(depth_mm: Array, best: npt.NDArray[np.int64], chance: Array, dept
     """
     chosen = depth_mm[np.arange(len(best)), best]
     same = np.abs(depth_mm - chosen[:, None]) < TOLERANCE_MM
-    timed = scipy.special.erf(TOLERANCE_MM / np.sqrt(2) / np.maximum(np.nan_to_num(depth_sd_mm, nan=1.0), 1e-6))
+    timed = scipy.special.erf(TOLERANCE_MM / np.sqrt(2) / np.maximum(without_nan(depth_sd_mm, 1.0), 1e-6))
     return np.where(np.isfinite(chosen), np.where(same, chance, 0.0).sum(axis=1) * timed, 0.0)
 
 
 def converter_limits(lines: npt.NDArray[np.int16]) -> tuple[int, int]:
     """Lowest and highest code if these are ends of a converter's range (a power of two), else values that never occur."""
-    low, high = int(lines.min(initial=0)), int(lines.max(initial=0))
+    # block by block: the second look finds the lines in the processor's cache
+    blocks = [lines[start : start + BLOCK] for start in range(0, len(lines), BLOCK)]
+    ends_of = [(int(block.min(initial=0)), int(block.max(initial=0))) for block in blocks]
+    low, high = min((end[0] for end in ends_of), default=0), max((end[1] for end in ends_of), default=0)
     ends = {2**bits - 1 for bits in range(7, 16)} | {32767}
     starts = {-(2**bits) for bits in range(7, 16)} | {-(2**bits) + 1 for bits in range(7, 16)} | {0}
     return (low if low in starts and low != high else -40000), (high if high in ends else 40000)
@@ -61,9 +67,8 @@ def clipped_share(recording: Recording, times_s: Array) -> Array:
     if (low < -32768 and high > 32767) or samples == 0:
         return np.zeros(len(times_s))
     half = max(int(acquisition.sampling_hz / acquisition.transducer_hz), 1)
-    centre = np.rint(np.nan_to_num(times_s) * acquisition.sampling_hz).astype(np.int64)
-    index = np.clip(centre[:, None] + np.arange(-half, half + 1), 0, samples - 1)
-    codes = np.take_along_axis(recording.lines, index, axis=1)
+    centre = np.rint(without_nan(times_s) * acquisition.sampling_hz).astype(np.int64)
+    codes = pick(recording.lines, clip(centre[:, None] + np.arange(-half, half + 1), 0, samples - 1))
     return np.where(np.isfinite(times_s), ((codes <= low) | (codes >= high)).mean(axis=1), 0.0)
 
 
@@ -73,21 +78,24 @@ def unstable(recording: Recording, depth_mm: Array, good: Bools, runs: npt.NDArr
     Neighbours that do not agree with each other are not looked at: then the probe moves, whatever its pose says.
     """
     count = len(depth_mm)
-    steps = [step for step in range(-REACH, REACH + 1) if step]
-    other = np.arange(count)[:, None] + np.array(steps)
+    if count <= LEAST_NEIGHBOURS:
+        return np.zeros(count, dtype=bool)
+    steps = np.array([step for step in range(-REACH, REACH + 1) if step])[:, None]
+    other = np.arange(count) + steps  # (2 REACH, n)
     inside = (other >= 0) & (other < count)
-    other = np.clip(other, 0, count - 1)
-    origin = recording.probe_to_reference[:, :3, 3]
-    moved = np.linalg.norm(origin[other] - origin[:, None], axis=2)
-    use = inside & good[other] & (runs[other] == runs[:, None]) & (np.nan_to_num(moved, nan=np.inf) < STILL_MM)
+    other = clip(other, 0, count - 1)
+    origin, beam = np.ascontiguousarray(recording.probe_to_reference[:, :3, 2:].transpose(2, 1, 0))[::-1]
+    way = origin[:, other] - origin[:, None]  # (3, 2 REACH, n)
+    use = inside & good[other] & (runs[other] == runs) & ((way**2).sum(axis=0) < STILL_MM**2)
     # the probe's own way along the beam is no change of the bone
-    along = np.einsum("nkj,nj->nk", origin[other] - origin[:, None], recording.probe_to_reference[:, :3, 2])
-    ahead = np.where(use, depth_mm[other] + along - depth_mm[:, None], np.nan)
-    enough = use.sum(axis=1) >= LEAST_NEIGHBOURS
-    middle = np.zeros(count)
-    middle[enough] = np.nanmedian(ahead[enough], axis=1)
-    near = (np.abs(ahead - middle[:, None]) < UNSTABLE_MM).sum(axis=1)  # not a number compares as false
-    return np.asarray(good & enough & (near >= AGREEING * use.sum(axis=1)) & (np.abs(middle) > UNSTABLE_MM))
+    ahead = np.where(use, depth_mm[other] + (way * beam[:, None]).sum(axis=0) - depth_mm, np.nan)
+    found = use.sum(axis=0)
+    enough = found >= LEAST_NEIGHBOURS
+    ordered, rows = np.sort(ahead.T, axis=1), np.arange(count)  # what is not a number comes last
+    last = np.maximum(found - 1, 0)
+    middle = np.where(enough, (ordered[rows, last // 2] + ordered[rows, (last + 1) // 2]) / 2, 0.0)
+    near = (np.abs(ahead - middle) < UNSTABLE_MM).sum(axis=0)  # not a number compares as false
+    return np.asarray(good & enough & (near >= AGREEING * found) & (np.abs(middle) > UNSTABLE_MM))
 
 
 def reasons_of(
@@ -103,14 +111,16 @@ def reasons_of(
     likely: Array,
 ) -> tuple[str, ...]:
     """Why each frame is not a point; empty for those that are. The first that applies of the list below."""
-    statuses = np.array(recording.statuses)
+    status = {one: np.array([other == one for other in recording.statuses], dtype=bool) for one in set(recording.statuses)}
+    none = np.zeros(len(quality), dtype=bool)
+    fine = status.get("OK", none)
     has_pose = np.isfinite(recording.probe_to_reference).all(axis=(1, 2))
     good = quality >= gate
     quiet = line_snr_db < QUIET_DB
     cases: list[tuple[str, Bools]] = [
-        ("pose missing", (statuses == "MISSING") | ((statuses == "OK") & ~has_pose)),
-        ("pose out of view", np.isin(statuses, ("OUT_OF_VIEW", "OUT_OF_VOLUME"))),
-        ("pose invalid", statuses != "OK"),
+        ("pose missing", status.get("MISSING", none) | (fine & ~has_pose)),
+        ("pose out of view", status.get("OUT_OF_VIEW", none) | status.get("OUT_OF_VOLUME", none)),
+        ("pose invalid", ~fine),
         ("saturated", clipped),
         ("unstable", shaky),
         ("", good),
@@ -119,7 +129,9 @@ def reasons_of(
         ("no echo", ~np.isfinite(depth_mm) | quiet | (likely < LIKELY)),
         ("doubtful echo", ~good),
     ]
-    chosen = np.select([case for _, case in cases], list(range(len(cases))), default=len(cases) - 1)
+    chosen = np.full(len(quality), len(cases) - 1)
+    for index in range(len(cases) - 1, -1, -1):
+        chosen[cases[index][1]] = index
     return tuple(cases[index][0] for index in chosen.tolist())
 
 
