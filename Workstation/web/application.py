@@ -323,7 +323,9 @@ def _modules(session: SessionFolder, logics: dict[str, Any], go_to: Any) -> list
 
     ultrasound = ModuleUltrasoundLogic()
     hand = simulated_hand.SimulatedHandLogic(
-        ultrasound.nextPoint, lambda: len(ultrasound.taken()) if ultrasound.recorded() else None
+        ultrasound.nextPoint,
+        lambda: len(ultrasound.taken()) if ultrasound.recorded() else None,
+        lambda: ultrasound.sweep is not None,
     )
     return [
         (REGISTRATION_PANEL, ModuleRegistrationLogic()),

@@ -71,8 +71,9 @@ PANEL = Panel(
         Step(
             "palpation",
             "Simulated hand",
-            "While the recording runs, the simulated hand rests on each point that is asked for. Those left out come again.",
-            (ParameterField("dwell_s"), Action("palpateAll", "Simulated hand: palpate all points", primary=True)),
+            "While the recording runs, the simulated hand rests on each point that is asked for, and those left out come again; "
+            "or it glides over the skull, when you palpate by a sweep.",
+            (ParameterField("dwell_s"), Action("palpateAll", "Simulated hand: palpate", primary=True)),
             status="palpationHandStatus",
         ),
         Step(
@@ -99,10 +100,12 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
     parameterClass = HandParameters
     sessionRole = "SimulationSession"
 
-    def __init__(self, skip: Callable[[], object], taken: Callable[[], int | None]) -> None:
+    def __init__(self, skip: Callable[[], object], taken: Callable[[], int | None], sweeping: Callable[[], bool]) -> None:
         super().__init__()
         self.skip, self.taken = skip, taken  # go on to the next point; how many are taken; None: not recording
+        self.sweeping = sweeping  # whether what is recorded is a sweep
         self._visit: Visit | None = None
+        self._glides_until_s = 0.0
         self._does = ("", "", 0.0)  # what was asked last, of what, and until when the hand is on its way
 
     def layPatient(self) -> Task:
@@ -156,7 +159,7 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         return f"the stylus goes to {waiting[0]}"
 
     def palpateAll(self) -> str:
-        """Palpate the planned points one after another."""
+        """Palpate the planned points one after another, or glide over them."""
         session = self._session()
         points = scene_data.get_points("ProtocolPoints")
         columns = scene_data.read_measurements(scene.find("ProtocolPoints"))
@@ -165,6 +168,9 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         if self.taken() is None:
             raise InputError("nothing is recorded yet; press Record first")
         session.put_away("Stylus")
+        if self.sweeping():
+            self._glides_until_s = time.monotonic() + session.sweep_plan()
+            return "the hand glides over the skull, there and back"
         self._visit = Visit(0, -1, 0.0)
         return f"the hand rests on each of {len(points)} points until it is taken"
 
@@ -172,6 +178,9 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         """While palpating: go where the protocol asks. A point that is not taken in time is left out."""
         visit, node = self._visit, scene.find("Protocol")
         session = running_simulation()
+        if self._glides_until_s and session is not None and (not self.sweeping() or time.monotonic() > self._glides_until_s):
+            session.put_away("Probe")
+            self._glides_until_s = 0.0
         if visit is None or session is None or node is None:
             return
         now, asked, count = time.monotonic(), int(node.GetParameter("current") or 0), len(scene_data.get_points("ProtocolPoints"))
@@ -233,6 +242,9 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
     def palpationHandStatus(self) -> StepStatus:
         """Whether the hand palpates while points are wanted."""
         taken, node = self.taken(), scene.find("ProtocolPoints")
+        if self.sweeping():
+            moves = running_simulation() is None or self._glides_until_s > 0
+            return done_or(moves, "let the simulated hand glide over the skull")
         idle = taken is not None and node is not None and taken < node.GetNumberOfControlPoints() and self._visit is None
         return done_or(running_simulation() is None or not idle, "let the simulated hand palpate the points")
 

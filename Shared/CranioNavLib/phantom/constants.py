@@ -127,6 +127,7 @@ MISSING_FRAME_SHARE = 0.03  # [M] frames in which the camera loses the probe
 STYLUS_TIP_MM = (1.2, -0.7, 118.6)  # [M] of the simulated stylus in its marker frame: what pivot calibration has to find
 SPHERE_TIP_MM = (-0.4, 0.9, 131.2)  # [M] of the tool with the sphere
 PROBE_FACE_MM = (2.1, 18.4, 96.0)  # [M] of the transducer's face in the probe's marker frame
+SWEEP_MM_S = 40.0  # [M] how fast such a probe slides
 MOVE_S = 1.2  # [M] from one place to the next
 LIFT_MM = 45.0  # [M] above the head on the way
 PIVOT_CONE_DEG = 28.0  # [M] half angle of a careful pivot calibration

@@ -66,3 +66,41 @@ class Path:
     def arrived(self, time_s: float) -> bool:
         """Whether the way is behind."""
         return time_s >= self.begin_s + self.duration_s
+
+
+@dataclass(frozen=True, eq=False)
+class Slide:
+    """To the first of many poses as a `Path` goes, then through all of them at a steady pace."""
+
+    approach: Path  # its goal is the first pose
+    poses: Array  # (L >= 2, 4, 4)
+    duration_s: float  # of the slide alone
+
+    @property
+    def begin_s(self) -> float:
+        """When the approach begins."""
+        return self.approach.begin_s
+
+    def at(self, time_s: float) -> Array:
+        """(4, 4) pose at a time."""
+        if not self.approach.arrived(time_s):
+            return self.approach.at(time_s)
+        step = self._share(time_s) * (len(self.poses) - 1)
+        before = min(int(step), len(self.poses) - 2)
+        turns = scipy.spatial.transform.Rotation.from_matrix(self.poses[before : before + 2, :3, :3])
+        share = step - before
+        turn = scipy.spatial.transform.Slerp([0.0, 1.0], turns)(share).as_matrix()
+        return rigid(turn, (1 - share) * self.poses[before, :3, 3] + share * self.poses[before + 1, :3, 3])
+
+    def arrived(self, time_s: float) -> bool:
+        """Whether the way is behind."""
+        return self._share(time_s) >= 1.0
+
+    def travelled_mm(self, time_s: float) -> float:
+        """Length of the slide so far."""
+        steps = np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0), axis=1)
+        return float(self._share(time_s) * steps.sum())
+
+    def _share(self, time_s: float) -> float:
+        begun_s = self.approach.begin_s + self.approach.duration_s
+        return float(np.clip((time_s - begun_s) / max(self.duration_s, 1e-6), 0.0, 1.0))

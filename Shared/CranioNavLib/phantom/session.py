@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Callable, Optional, Union
 
 import numpy as np
@@ -17,14 +17,16 @@ import numpy.typing as npt
 
 from CranioNavLib.errors import InputError
 from CranioNavLib.phantom import constants
-from CranioNavLib.phantom.hand import Skill, frames_along, stand_at
-from CranioNavLib.phantom.motion import Path, Tremor
+from CranioNavLib.phantom.hand import Skill, frames_along, slide_over, stand_at
+from CranioNavLib.phantom.motion import Path, Slide, Tremor
+from CranioNavLib.phantom.palpation import STANDING_ERROR_MM
 from CranioNavLib.phantom.patient import VirtualPatient, make_patient
 from CranioNavLib.phantom.tracking import STANDING_SHARE, disturb, draw_error
 from CranioNavLib.phantom.ultrasound import LineSource
 from CranioNavLib.rigid import Array, invert_rigid, rigid, rigid_from_vector, transform_points
 from CranioNavLib.sequence_metafile import Acquisition
 
+SLIDE_STEP_MM = 1.0  # between the poses that a slide is made of
 REFERENCE, PROBE, STYLUS, SPHERE = "Reference", "Probe", "Stylus", "Sphere"
 TOOLS = (REFERENCE, PROBE, STYLUS, SPHERE)
 # tip (or face, or centre) in the frame of the tool's markers
@@ -62,7 +64,7 @@ class SteppedClock:
 class _Held:
     """What the hand does with one tool. Poses are of the calibrated tool (tip at the origin), in Reference."""
 
-    path: Path
+    path: Union[Path, Slide]
     slide_mm: Tremor
     tilt_rad: Tremor
     number: int
@@ -195,6 +197,29 @@ class SimulatedSession:
         self.play([*((point * each, visit(point)) for point in range(count)), (count * each, lambda: self.put_away(PROBE))])
         return count * each
 
+    def sweep_plan(self) -> float:
+        """Slide the probe over the skin through the points of the plan, the nearest next, and back. Returns how long it takes, s.
+
+        Raises
+        ------
+        InputError
+            The plan has fewer than two points.
+        """
+        places, normals = self._plan
+        if len(places) < 2:
+            raise InputError(f"the palpation plan has {len(places)} points, a sweep needs two; set a plan first")
+        order = _nearest_next(places)
+        way = [*order, *order[-2::-1]]
+        length_mm = float(np.linalg.norm(np.diff(places[way], axis=0), axis=1).sum())
+        with self._lock:
+            poses = slide_over(self.patient, places[way], normals[way], max(2, int(length_mm / SLIDE_STEP_MM)), self._rng)
+            self._hold(PROBE, self.patient.ras_to_reference @ poses[0], 0.0)
+            held, self.palpation_point = self._held[PROBE], -1
+            approach, duration_s = held.path, length_mm / constants.SWEEP_MM_S
+            assert isinstance(approach, Path)
+            self._held[PROBE] = replace(held, path=Slide(approach, self.patient.ras_to_reference @ poses, duration_s))
+        return approach.duration_s + duration_s
+
     # --- what the devices see and hear ----------------------------------------------------------------------------
 
     @property
@@ -228,14 +253,14 @@ class SimulatedSession:
         `noise` scales the tracker's error. Not `calibrated`: poses are of the tools' marker frames, their tips unknown.
         """
         base = self.reference_to_tracker(time_s)
-        reported: dict[str, Optional[Array]] = {REFERENCE: self._seen(REFERENCE, base, self._count, noise)}
+        reported: dict[str, Optional[Array]] = {REFERENCE: self._seen(REFERENCE, base, (self._count,), noise)}
         for tool in TOOLS[1:]:
             pose = self.tool_to_reference(tool, time_s)
             if pose is None:
                 reported[tool] = None
                 continue
             tip = rigid(np.eye(3), TIPS_MM[tool])
-            seen = self._seen(tool, base @ pose @ invert_rigid(tip), self._held_number(tool), noise)
+            seen = self._seen(tool, base @ pose @ invert_rigid(tip), self._held_number(tool, time_s), noise)
             if calibrated:
                 seen = seen @ tip @ self.patient.probe_calibration_error if tool == PROBE else seen @ tip
             reported[tool] = seen
@@ -287,13 +312,18 @@ class SimulatedSession:
             divot_mm=divot,
         )
 
-    def _held_number(self, tool: str) -> int:
+    def _held_number(self, tool: str, time_s: float) -> tuple[int, ...]:
+        """Of what the hand does with a tool, and of how far it has slid: the standing error changes as a tool gets about."""
         held = self._held.get(tool)
-        return held.number if held is not None else 0
+        if held is None:
+            return (0,)
+        if isinstance(held.path, Slide):
+            return (held.number, int(held.path.travelled_mm(time_s) // STANDING_ERROR_MM))
+        return (held.number,)
 
-    def _seen(self, tool: str, true_pose: Array, number: int, noise: float) -> Array:
+    def _seen(self, tool: str, true_pose: Array, number: tuple[int, ...], noise: float) -> Array:
         """A marker frame's pose with the tracker's error; its standing part is drawn anew with each thing the hand does."""
-        standing = draw_error(np.random.default_rng([self._seed, TOOLS.index(tool), number]), 1)
+        standing = draw_error(np.random.default_rng([self._seed, TOOLS.index(tool), *number]), 1)
         with self._lock:
             moving = draw_error(self._rng, 1)
         error = noise * (STANDING_SHARE * standing + constants.TRACKER_JITTER_SHARE * moving)
@@ -303,6 +333,15 @@ class SimulatedSession:
     def _run_script(self, time_s: float) -> None:
         while self._script and self._script[0][0] <= time_s:
             self._script.pop(0)[1]()
+
+
+def _nearest_next(places: Array) -> list[int]:
+    """An order of points (N, 3) from the first to the nearest that is left, and so on."""
+    order, left = [0], set(range(1, len(places)))
+    while left:
+        order.append(min(left, key=lambda one: float(np.linalg.norm(places[one] - places[order[-1]]))))
+        left.remove(order[-1])
+    return order
 
 
 def _scaled(tremor: Tremor, sd: float) -> Tremor:

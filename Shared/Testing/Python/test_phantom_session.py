@@ -127,6 +127,25 @@ def test_a_scripted_palpation_visits_every_point_and_puts_the_probe_away(a_sessi
     assert list(dict.fromkeys(visited)) == [0, 1, 2, 3, 4, -1]
 
 
+def test_a_sweep_slides_over_every_point_of_the_plan_at_its_pace_and_with_the_skin(a_session, a_patient):
+    places = outer_seats(a_patient.bone, a_patient.skin, np.random.default_rng(0))[0][:5]
+    took = a_session.sweep_plan()
+    begun = a_session.clock.now() + constants.MOVE_S
+    times = np.arange(begun, begun - constants.MOVE_S + took, 0.05)
+    poses = np.stack([a_session.tool_to_reference("Probe", time_s) for time_s in times])
+    ras = transform_points(a_patient.true_reference_to_ras, poses[:, :3, 3])
+    assert a_patient.skin.closest(ras).distances_mm.max() < constants.FORERUN_LENGTH_MM + 5
+    for place in places:
+        assert np.linalg.norm(ras - place, axis=1).min() < constants.FORERUN_LENGTH_MM + 25, (
+            "the probe's face stands over each point"
+        )
+    speeds = np.linalg.norm(np.diff(ras, axis=0), axis=1) / 0.05
+    assert 0.5 * constants.SWEEP_MM_S < np.median(speeds) < 2 * constants.SWEEP_MM_S
+    assert a_session.palpation_point == -1
+    with pytest.raises(InputError, match="a sweep needs two"):
+        SimulatedSession(a_patient, clock=SteppedClock()).sweep_plan()
+
+
 def test_reported_poses_scatter_by_the_noise_asked_for(a_session):
     for noise, low, high in ((0.0, -1e-9, 1e-9), (1.0, 0.03, 0.4)):
         base = np.array([a_session.reported_poses(0.05 * k, noise=noise)["Reference"][:3, 3] for k in range(100)])
