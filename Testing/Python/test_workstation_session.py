@@ -108,6 +108,28 @@ def test_a_session_killed_at_any_step_goes_on_exactly_where_it_was(a_recorded_pa
     assert scene_data.get_points("RegisteredPoints").labels
 
 
+def test_a_report_that_differs_from_the_screen_says_why(tmp_path):
+    from CranioNavLib import scene
+    from CranioNavLib.panel import Level
+
+    running = Workstation(tmp_path / "session")
+    report, ultrasound = running.logics["Session"], running.logics["ModuleUltrasound"].parameters()
+    node = scene_data.set_transform("ReferenceToRas", np.eye(4))
+    node.SetAttribute(scene.STATUS_ATTRIBUTE, "accepted")
+    assert report._report_written(0.01) == "written; the registration from the files is the one on the screen"
+    unexplained = report._report_written(0.4)
+    assert (unexplained.level, "0.40 mm" in unexplained.text) == (Level.WARNING, True)
+    assert "no setting explains it" in unexplained.text
+    ultrasound.change(speed_of_sound_m_s=1600.0)
+    running.logics["ModuleRegistration"].pluginSettings("segmentation", "threshold").change(threshold_hu=400.0)
+    said = report._report_written(0.4).text
+    assert "speed of sound is 1600.0 m/s (usual 15" in said
+    assert "400.0 HU" in said
+    assert said.count("(usual") == 2, "those that differ, and no others"
+    node.SetAttribute(scene.STATUS_ATTRIBUTE, "landmarks")
+    assert "by landmarks alone" in report._report_written(4.0).text
+
+
 def test_an_earlier_recording_is_set_aside_under_a_number(tmp_path):
     path = tmp_path / "palpation.igs.mha"
     assert set_aside(path) is None

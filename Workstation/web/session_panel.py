@@ -14,9 +14,10 @@ import numpy as np
 from CranioNavLib import scene, scene_data
 from CranioNavLib.errors import InputError
 from CranioNavLib.module_logic import ParametersInScene
-from CranioNavLib.panel import Action, Level, Panel, Progress, Reading, ReadOut, Step, StepState, StepStatus, Task
+from CranioNavLib.panel import Action, Level, Panel, Progress, Reading, ReadOut, Step, StepState, StepStatus, Task, words_of
 from CranioNavLib.parameters import Parameters
 from CranioNavLib.scripted_module import ScriptedLoadableModuleLogic
+from ModuleUltrasoundLib.measure import EchoSettings
 
 from Workstation.web.session_folder import SessionFolder, last_session
 
@@ -176,12 +177,40 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
             return "register first (steps 5 and 6)"
         return "" if (self.session.folder / "ct.nrrd").is_file() else "the CT is still being saved"
 
-    def _report_written(self, difference_mm: float) -> str:
+    def _report_written(self, difference_mm: float) -> str | Reading:
         self._report_of = json.dumps(scene_data.get_transform("ReferenceToRas").tolist())
         self.session.reported = True
         if difference_mm > SAME_MM:
-            return f"written; settings differ from the defaults, so the report's registration lies {difference_mm:.2f} mm off"
+            said = (
+                f"written; its registration lies up to {difference_mm:.2f} mm from the one on the screen: {self._why_different()}"
+            )
+            return Reading(said, Level.WARNING)
         return "written; the registration from the files is the one on the screen"
+
+    def _why_different(self) -> str:
+        """What the report was made of and the registration on the screen was not."""
+        if scene.find_or_create("ReferenceToRas").GetAttribute(scene.STATUS_ATTRIBUTE) == "landmarks":
+            return "that is by landmarks alone, the report's by the bone points; register the surface (step 6)"
+        others = self._other_settings()
+        if others:
+            return f"the report uses the usual settings, here {', '.join(others)}"
+        return "no setting explains it; register the surface again (step 6), then write the report again"
+
+    def _other_settings(self) -> list[str]:
+        """The settings of measuring and registering that are not the usual ones, which the report is made with."""
+        registration, ultrasound = self._logics["ModuleRegistration"], self._logics["ModuleUltrasound"]
+        wanted = registration.parameters().read()
+        read = [(ultrasound.parameters().read(), set(EchoSettings.__dataclass_fields__))]
+        for kind in ("registration", "segmentation"):
+            name = wanted.method if kind == "registration" else wanted.segmentation
+            settings = registration.pluginSettings(kind, name).read()
+            read.append((settings, {info.name for info in settings.describe()}))
+        return [
+            f"{words_of(info.name).lower()} is {getattr(values, info.name)} {info.unit}".rstrip() + f" (usual {info.default})"
+            for values, names in read
+            for info in values.describe()
+            if info.name in names and getattr(values, info.name) != info.default
+        ]
 
     def reportFiles(self) -> Reading | None:
         """What there is to open."""
