@@ -19,12 +19,14 @@ from CranioNavLib.rigid import Array
 from ModuleUltrasoundLib.echo_candidates import DECIBEL, Candidates
 from ModuleUltrasoundLib.echo_network import Likelihood, probabilities
 from ModuleUltrasoundLib.echo_search import Found
+from ModuleUltrasoundLib.lean import without_nan
 
 SAME_MM = 0.35  # SD of a hand's tremor along the beam from line to line: how near candidates support each other
 BIN_MM = 0.2
 REACH = 4  # neighbouring lines on each side
 FAR_REACH = 20  # the same, of a long stay or a slow glide
 SAME_FAR_MM = 0.6  # the bone's depth wanders over so many
+BLUR_STEP = 64  # bins: maps are of many sizes, matrices for them of a few
 USUAL_MM = 1.2  # the scalp of a head is about as thick from place to place
 SURE = 0.85
 LEAST_FOR_SHARED = 3  # lines with a likely bone before anything is learnt from the recording
@@ -124,13 +126,14 @@ def shared_features(found: Found, scores: Array, runs: npt.NDArray[np.int64], ec
     for number, name in enumerate(SHARED_NAMES):
         stacked[..., number] = values[name]
     stacked[~valid] = 0
-    return np.nan_to_num(stacked, copy=False)
+    stacked[np.isnan(stacked)] = 0
+    return np.asarray(stacked)
 
 
 def _rival(support: Array) -> Array:
-    """The best support of the other candidates."""
-    order = np.sort(support, axis=1)
-    return np.where(support == order[:, -1:], order[:, -2:-1], order[:, -1:])
+    """The best support (n, K) of the other candidates."""
+    order = np.sort(support, axis=1)[:, -2:].T
+    return np.where(order[-1] == support.T, order[0], order[-1]).T
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,15 +157,8 @@ class Neighbours:
 
     def mean(self, values: Array) -> Array:
         """Mean (n, M) over the neighbours of values (n, M); 0 without any."""
-        return self.mean_of(values, running_sums(values))
-
-    def mean_of(self, values: npt.NDArray[Real], sums: npt.NDArray[Real]) -> npt.NDArray[Real]:
-        """As mean, of values whose running sums are known."""
-        total = sums[self.last]
-        total -= sums[self.first]
-        total -= values
-        total *= (1 / np.maximum(self.number, 1)[:, None]).astype(total.dtype)
-        return total
+        sums = running_sums(values)
+        return np.asarray((sums[self.last] - sums[self.first] - values) / np.maximum(self.number, 1)[:, None])
 
 
 def running_sums(values: npt.NDArray[Real]) -> npt.NDArray[Real]:
@@ -176,35 +172,48 @@ def running_sums(values: npt.NDArray[Real]) -> npt.NDArray[Real]:
 class DepthMap:
     """Weights of the candidates of n lines, entered at their depths."""
 
-    bins: npt.NDArray[np.int64]  # (n, K) of each candidate; -1: none
+    bins: npt.NDArray[np.int64]  # (K, n) of each candidate; -1: none
     values: npt.NDArray[np.float32]  # (n, M)
-    sums: npt.NDArray[np.float32]  # (n + 1, M) running over the lines
 
     @classmethod
     def of(cls, weight: Array, depth_mm: Array) -> DepthMap:
         """The map of weights (n, K) that belong to depths (n, K)."""
-        bins = np.nan_to_num(depth_mm / BIN_MM, nan=-1.0).astype(np.int64)
-        rows = np.arange(len(bins))
-        values = np.zeros((len(bins), int(bins.max(initial=0)) + 2), dtype=np.float32)
-        for rank in range(bins.shape[1]):  # one after the other, because two candidates may share a bin
-            values[rows, bins[:, rank]] += np.where(bins[:, rank] >= 0, weight[:, rank], 0)
-        values[:, -1] = 0
-        return cls(bins, values, running_sums(values))
+        bins = without_nan(depth_mm.T / BIN_MM, -1.0).astype(np.int64)
+        count, size = len(depth_mm), int(bins.max(initial=0)) + 2
+        if count < 2:  # nobody to compare with
+            return cls(bins, np.zeros((count, size), dtype=np.float32))
+        flat = np.bincount(
+            (np.where(bins < 0, size - 1, bins) + np.arange(0, count * size, size)).reshape(-1),
+            np.where(bins < 0, 0.0, weight.T).reshape(-1),
+            count * size,
+        )
+        return cls(bins, flat.reshape(count, size).astype(np.float32))
 
     def mean(self, neighbours: Neighbours | None, same_mm: float) -> Array:
         """Mean weight (n, K) that the neighbours (None: all other lines) of each line give to its candidates' depths.
 
         It counts fully at the very depth, less by a Gaussian of `same_mm`.
         """
+        return self.means(same_mm, neighbours)[0]
+
+    def means(self, same_mm: float, *among: Neighbours | None) -> list[Array]:
+        """As mean, for several kinds of neighbours."""
         count, size = self.values.shape
         if count < 2:
-            return np.zeros(self.bins.shape)
-        if neighbours is None:
-            mean = (self.sums[-1] - self.values) * np.float32(1 / (count - 1))
-        else:
-            mean = neighbours.mean_of(self.values, self.sums)
-        blurred = mean @ _blur(size, same_mm)
-        return np.where(self.bins >= 0, np.take_along_axis(blurred, np.clip(self.bins, 0, None), axis=1), 0.0)
+            return [np.zeros(self.bins.T.shape) for _ in among]
+        blurred = self.values @ _blur(-(-size // BLUR_STEP) * BLUR_STEP, same_mm)[:size, :size]
+        flat = blurred[:0] if among == (None,) else running_sums(blurred).reshape(-1)
+        column, row = np.maximum(self.bins, 0), np.arange(0, count * size, size)
+        own = blurred.reshape(-1).take(column + row)
+        means = []
+        for neighbours in among:
+            if neighbours is None:
+                mean = (blurred.sum(axis=0).take(column) - own) / (count - 1)
+            else:
+                total = flat.take(column + neighbours.last * size) - flat.take(column + neighbours.first * size)
+                mean = (total - own) / np.maximum(neighbours.number, 1)
+            means.append(np.where(self.bins < 0, 0.0, mean).T)
+        return means
 
 
 @lru_cache(maxsize=16)
@@ -230,9 +239,10 @@ class Echoes:
         own = Neighbours.within(runs, len(runs))
         all_others = max(len(runs) - 1, 0)
         others = (all_others - own.number)[:, None]
-        elsewhere = here.mean(None, SAME_MM) * all_others - here.mean(own, SAME_MM) * own.number[:, None]
+        near, of_own, of_all = here.means(SAME_MM, Neighbours.within(runs, REACH), own, None)
+        elsewhere = of_all * all_others - of_own * own.number[:, None]
         return cls(
-            here.mean(Neighbours.within(runs, REACH), SAME_MM),
+            near,
             np.clip(elsewhere / np.maximum(others, 1), 0, 2),
             np.minimum(others / 10, 1),
         )
