@@ -110,9 +110,15 @@ def watch_loop() -> None:
     import asyncio
 
     run = asyncio.events.Handle._run
+    read_s = used = (
+        0.0  # the thread's processor time, and when it was read: to read it each time would take longer than much else
+    )
 
     def timed(self: Any) -> None:
-        begun, used = time.monotonic(), time.thread_time()
+        nonlocal read_s, used
+        begun = time.monotonic()
+        if begun > read_s + STALL_S / 2:
+            read_s, used = begun, time.thread_time()
         run(self)
         if time.monotonic() - begun > STALL_S:
             what = getattr(self._callback, "__qualname__", "") or repr(self._callback)[:80]

@@ -244,8 +244,10 @@ class WorkstationApp(TrameApp):
                     state.live = drawings(self.logics[ULTRASOUND])
                 state.files = self.logics[SESSION].offered()
                 state.simulated = self._is_simulated()
-            for name in (*modules_of(self.server.state.step), next(self._in_turn)):
+            for name in modules_of(self.server.state.step):
                 self.panels[name].refresh()
+            if not moves or turn % (3 * REFRESH_EVERY) == 0:
+                self.panels[next(self._in_turn)].refresh()
 
     def _keep(self, turn: int) -> None:
         """Save what is new; let go of windows that take nothing."""

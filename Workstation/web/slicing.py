@@ -170,7 +170,7 @@ def draw_ring(picture: npt.NDArray[np.uint8], to_slice: npt.NDArray[np.float64],
     reach, (height, width, _) = radius + RING_HALF + 1.0, picture.shape
     low = np.clip(np.floor([up - reach, across - reach]), 0, (height, width)).astype(int)
     high = np.clip(np.ceil([up + reach, across + reach]) + 1, 0, (height, width)).astype(int)
-    rows, columns = np.ogrid[low[0] : high[0], low[1] : high[1]]
+    rows, columns = np.arange(low[0], high[0])[:, None], np.arange(low[1], high[1])
     distance = np.abs(np.hypot(rows - up, columns - across) - radius)
     share = np.clip(RING_HALF + 0.5 - distance, 0.0, 1.0)[..., None]
     part = picture[low[0] : high[0], low[1] : high[1]]
