@@ -24,7 +24,7 @@ TYPICAL_ATTENUATION = 1.0  # dB/cm/MHz; only ranks candidates, soft tissue has 0
 LEVEL_WEIGHT, RISE_WEIGHT, BEFORE_WEIGHT, BEHIND_WEIGHT = (np.float32(x) for x in (1.6, 0.3, 0.2, 0.8))
 SALIENCE_GUARD_CYCLES = 2.0
 BARRED = np.float32(1e30)
-ROWS = 64  # lines worked on at once: the working set stays in the processor's second cache
+ROWS = 128  # lines worked on at once: the working set stays in the processor's second cache
 TILE = 32  # samples whose running sums are one product with a small matrix
 _STEPS = np.array([-1, 0, 1])[:, None, None]
 _SUM_UP = np.triu(np.ones((TILE, TILE), dtype=np.float32), k=1)
@@ -85,13 +85,13 @@ def logarithm(magnitude: Floats) -> Floats:
     return np.asarray(np.log(log, out=log))
 
 
-def take_levels(log: Floats, length: int, sums: Floats | None = None) -> Levels:
-    """Levels of envelopes of `length` samples from their `logarithm`; the sums are written to `sums` if given."""
+def take_levels(log: Floats, length: int) -> Levels:
+    """Levels of envelopes of `length` samples from their `logarithm`."""
     # within tiles by a matrix, then the tiles before: a third of the time of cumsum
     tiles = (log.reshape(-1, TILE) @ _SUM_UP).reshape(len(log), -1, TILE)
     before = np.zeros(tiles.shape[:2], dtype=np.float32)
     np.cumsum(tiles[:, :-1, -1] + log[:, TILE - 1 : -1 : TILE], axis=1, out=before[:, 1:])
-    return Levels(np.add(tiles.reshape(log.shape), np.repeat(before, TILE, axis=1), out=sums), length)
+    return Levels(tiles.reshape(log.shape) + np.repeat(before, TILE, axis=1), length)
 
 
 def noise_level(levels: Levels) -> Array:
@@ -174,7 +174,10 @@ def _salience(log: Floats, levels: Levels, first: int, last: int, guard: int, le
     score[lead:] -= mean.reshape(-1)[:-lead]
     rising = log.reshape(-1)[1:] > log.reshape(-1)[:-1]
     peak = rising[:-1] > rising[1:]
-    score[1:-1] += (peak.view(np.int8) - np.int8(1)) * BARRED  # a sum: choices that nothing foretells are slow
+    bar = peak.astype(np.float32)
+    bar -= 1
+    bar *= BARRED
+    score[1:-1] += bar  # a sum: choices that nothing foretells are slow
     score = score.reshape(-1, width)[:, lead + 1 : lead + last - first - 1].copy()
     score += np.tile(rise, (len(score), 1))
     return score
@@ -217,30 +220,26 @@ def find_candidates(
     first = max(int((skin + window_s[0]) * rate), 0)
     last = min(int((skin + window_s[1]) * rate) + 1, length)
     rise = TYPICAL_ATTENUATION * transducer_hz * 1e-6 * 154e3  # dB a second of delay: 77 km/s of depth, both ways, per cm
-    levels = Levels(np.empty((count, padded(length)), dtype=np.float32), length)
     samples = np.empty((CANDIDATES, count), dtype=np.int64)
+    noise, mean = np.empty(count), np.empty((8, CANDIDATES, count), dtype=np.float32)
     for start in range(0, count, ROWS):
         rows = slice(start, start + ROWS)
         log = logarithm(magnitude[rows])
-        some = take_levels(log, length, levels.sums[rows])
+        levels = take_levels(log, length)
+        noise[rows] = noise_level(levels)
         if last - first >= 6:
-            samples[:, rows] = salient_peaks(log, some, rate, rise, first, last, SALIENCE_GUARD_CYCLES / transducer_hz).T
+            some = salient_peaks(log, levels, rate, rise, first, last, SALIENCE_GUARD_CYCLES / transducer_hz).T
+            samples[:, rows], mean[..., rows] = some, _surroundings(levels, some, rate, transducer_hz, int(skin * rate))
     if last - first < 6:
-        return _none(count, noise_level(levels))
-    return _describe(envelopes, magnitude, levels, samples.T, skin_s, int(skin * rate), transducer_hz)
+        return _none(count, noise)
+    return _describe(envelopes, magnitude, samples.T, mean, noise, skin_s)
 
 
 def _describe(
-    envelopes: Envelopes,
-    magnitude: Floats,
-    levels: Levels,
-    samples: npt.NDArray[np.int64],
-    skin_s: Array,
-    skin_sample: int,
-    transducer_hz: float,
+    envelopes: Envelopes, magnitude: Floats, samples: npt.NDArray[np.int64], mean: Floats, noise: Array, skin_s: Array
 ) -> Candidates:
-    """What speaks for and against the echoes at `samples` (n, K)."""
-    rate, noise = envelopes.rate_hz, noise_level(levels)
+    """What speaks for and against the echoes at `samples` (n, K), of whose surroundings the `mean` (8, K, n) is known."""
+    rate = envelopes.rate_hz
     positions, heights, widths = (values.T for values in fit_tops(magnitude, samples))
     number = samples.T
     back, here, ahead = _at(envelopes.values, clip(number + _STEPS, 0, magnitude.shape[1] - 1))
@@ -250,7 +249,6 @@ def _describe(
     frequencies = envelopes.carrier_hz + np.angle(ahead * back.conj()) * (rate / (4 * np.pi))
     frequencies[number < 0] = np.nan
     height, base = np.log(heights), np.log(noise) + LOG_RAYLEIGH
-    mean = _surroundings(levels, number, rate, transducer_hz, skin_sample)
     over, under = DECIBEL * (height - mean[:3]), DECIBEL * (mean[3:] - base)
     return Candidates(
         delays_s=(times - skin_s).T,

@@ -16,7 +16,7 @@ from ModuleUltrasoundLib.echo_candidates import Candidates, concatenate, find_ca
 from ModuleUltrasoundLib.echo_features import line_features
 from ModuleUltrasoundLib.echo_timing import BEFORE, BEHIND, Complexes
 from ModuleUltrasoundLib.lean import pick
-from ModuleUltrasoundLib.signal_chain import Band, Envelopes, check_acquisition, complex_envelopes, design_band
+from ModuleUltrasoundLib.signal_chain import Band, Envelopes, check_acquisition, design_band, envelopes_of
 from ModuleUltrasoundLib.signal_forerun import Forerun, find_forerun, nominal_skin_s, steady, suppress_multiples
 
 BANG_SAMPLES = 40  # ten cycles
@@ -121,8 +121,7 @@ def search_lines(
 def _search_batch(lines: npt.NDArray[np.int16], search: Search) -> Found:
     """The echoes of some lines; `bang` is the sum over them."""
     acquisition, rank = search.acquisition, search.rank
-    envelopes = complex_envelopes(lines, search.band)
-    magnitude = np.abs(envelopes.values)
+    envelopes, magnitude = envelopes_of(lines, search.band)
     bang = np.zeros(BANG_SAMPLES, dtype=np.complex128)
     start = envelopes.values[:, :BANG_SAMPLES].sum(axis=0)
     bang[: len(start)] = start

@@ -55,7 +55,7 @@ class Band:
     rate_hz: float
     carrier_hz: float
     fade: Floats  # weights of a line's last samples: a hum that is cut off would pass the band
-    quarter: Floats  # weights of a mean over a quarter of the line
+    ends: Floats  # (Q, 2) weights of the line's last samples that give its offset and its drift a sample
 
 
 def check_acquisition(acquisition: Acquisition) -> None:
@@ -110,7 +110,7 @@ def design_band(acquisition: Acquisition, samples: int, until_s: float) -> Band:
         rate_hz=out_length * step,
         carrier_hz=middle * step,
         fade=fade.astype(np.float32),
-        quarter=np.full(max(length // 4, 1), 1 / max(length // 4, 1), dtype=np.float32),
+        ends=_ends(length).astype(np.float32),
     )
 
 
@@ -119,16 +119,32 @@ def _trend(length: int) -> npt.NDArray[np.float64]:
     return np.stack([np.ones(length), np.arange(length) - (length - max(length // 4, 1) / 2 - 0.5)])
 
 
+def _ends(length: int) -> npt.NDArray[np.float64]:
+    """Weights (Q, 2) of a line's second half: the mean of its last quarter, and the rise to it from the quarter before."""
+    quarter = max(length // 4, 1)
+    weights = np.zeros((min(2 * quarter, length), 2))
+    weights[-quarter:] = np.array([1.0, 1 / quarter]) / quarter
+    weights[:quarter, 1] -= 1 / quarter**2
+    return weights
+
+
 def complex_envelopes(lines: npt.NDArray[np.int16], band: Band) -> Envelopes:
     """Complex envelopes of RF lines (n, N): DC and drift removed, band-passed without phase, demodulated."""
+    return envelopes_of(lines, band)[0]
+
+
+def envelopes_of(lines: npt.NDArray[np.int16], band: Band) -> tuple[Envelopes, Floats]:
+    """As complex_envelopes, and their magnitude (n, M), taken while they are in the processor's cache."""
     size, below = band.gain.shape[1], band.below
     keep = min(band.out_length, int(np.ceil(band.length * band.out_length / band.padded)))
     values = np.empty((len(lines), keep), dtype=np.complex64)
+    magnitude = np.empty(values.shape, dtype=np.float32)
     rows = min(BLOCK, len(lines))
     whole = np.zeros((rows, band.padded), dtype=np.float32)
     shifted = np.zeros((rows, 2 * band.out_length), dtype=np.float32)
     for start in range(0, len(lines), BLOCK):
-        some = lines[start : start + BLOCK, : band.length]
+        block = slice(start, start + BLOCK)
+        some = lines[block, : band.length]
         rf = whole[: len(some)]
         rf[:, : band.length] = some
         trend = trends(rf[:, : band.length], band)
@@ -139,19 +155,17 @@ def complex_envelopes(lines: npt.NDArray[np.int16], band: Band) -> Envelopes:
         turned = shifted[: len(some)]  # the carrier comes first, what lies below it last
         turned[:, : size - below] = spectrum[:, below:]
         turned[:, 2 * band.out_length - below :] = spectrum[:, :below]
-        values[start : start + BLOCK] = scipy.fft.ifft(turned.view(np.complex64), axis=1)[:, :keep]
-    return Envelopes(values=values, rate_hz=band.rate_hz, carrier_hz=band.carrier_hz)
+        values[block] = scipy.fft.ifft(turned.view(np.complex64), axis=1)[:, :keep]
+        np.abs(values[block], out=magnitude[block])
+    return Envelopes(values=values, rate_hz=band.rate_hz, carrier_hz=band.carrier_hz), magnitude
 
 
 def trends(rf: Floats, band: Band) -> Floats:
-    """Offset and straight-line drift (n, 2) of lines (n, N), the drift 0 where it makes no step that matters.
+    """Offset and straight-line drift a sample (n, 2) of lines (n, N), the drift 0 where it makes no step that matters.
 
     Both are taken from the quiet second half. Slower waves are left to the band-pass; only the step between a line's end and
     its start would pass it.
     """
-    quarter, length = len(band.quarter), rf.shape[1]
-    before = max(length - 2 * quarter, 0)
-    offset = rf[:, length - quarter :] @ band.quarter
-    slope = (offset - rf[:, before : before + quarter] @ band.quarter) / np.float32(quarter)
-    slope[np.abs(slope) * length <= LEAST_DRIFT] = 0
-    return np.stack([offset, slope], axis=1)
+    trend = rf[:, rf.shape[1] - len(band.ends) :] @ band.ends
+    trend[:, 1] *= np.abs(trend[:, 1]) * rf.shape[1] > LEAST_DRIFT
+    return np.asarray(trend)
