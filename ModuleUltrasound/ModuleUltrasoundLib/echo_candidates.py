@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.rigid import Array
 
-from ModuleUltrasoundLib.lean import Scalar, clip, median
+from ModuleUltrasoundLib.lean import at_samples, clip, median
 from ModuleUltrasoundLib.signal_chain import Envelopes, Floats
 
 CANDIDATES = 8  # echoes kept of a line
@@ -119,7 +119,7 @@ def fit_tops(magnitude: Floats, samples: npt.NDArray[np.int64]) -> tuple[Array, 
     """As refine_peaks, and the standard deviation (samples) of the Gaussian that has each peak's curvature."""
     number = samples.T
     safe = clip(number, 1, magnitude.shape[1] - 2)
-    around = _at(magnitude, safe + _STEPS)
+    around = at_samples(magnitude, safe + _STEPS)
     left, mid, right = np.log(around.astype(float) + 1e-9)
     curvature = np.minimum(left - 2 * mid + right, -1e-6)
     slope = left - right
@@ -130,11 +130,6 @@ def fit_tops(magnitude: Floats, samples: npt.NDArray[np.int64]) -> tuple[Array, 
     for values in (position, height, width):
         values[bad] = np.nan
     return position.T, height.T, width.T
-
-
-def _at(values: npt.NDArray[Scalar], samples: npt.NDArray[np.int64]) -> npt.NDArray[Scalar]:
-    """Samples (..., n) of each line of values (n, M)."""
-    return np.asarray(values.reshape(-1).take(samples + np.arange(0, values.size, values.shape[1])))
 
 
 def salient_peaks(
@@ -242,7 +237,7 @@ def _describe(
     rate = envelopes.rate_hz
     positions, heights, widths = (values.T for values in fit_tops(magnitude, samples))
     number = samples.T
-    back, here, ahead = _at(envelopes.values, clip(number + _STEPS, 0, magnitude.shape[1] - 1))
+    back, here, ahead = at_samples(envelopes.values, clip(number + _STEPS, 0, magnitude.shape[1] - 1))
     times = positions / rate
     # the baseband phase hardly changes within a sample; the carrier's phase is that of the refined time
     phases = np.angle(here) + 2 * np.pi * envelopes.carrier_hz * times
@@ -300,6 +295,8 @@ def _none(count: int, noise: Array) -> Candidates:
 
 def concatenate(parts: list[Candidates]) -> Candidates:
     """The candidates of several batches as one."""
+    if len(parts) == 1:
+        return parts[0]
     names = Candidates.__dataclass_fields__
     return Candidates(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 

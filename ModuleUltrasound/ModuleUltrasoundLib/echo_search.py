@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Optional
+from typing import Any, Optional
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ from CranioNavLib.sequence_metafile import Acquisition, Recording
 from ModuleUltrasoundLib.echo_candidates import Candidates, concatenate, find_candidates, reorder, rough_noise
 from ModuleUltrasoundLib.echo_features import line_features
 from ModuleUltrasoundLib.echo_timing import BEFORE, BEHIND, Complexes
-from ModuleUltrasoundLib.lean import pick
+from ModuleUltrasoundLib.lean import at_samples, clip, pick, without_nan
 from ModuleUltrasoundLib.signal_chain import Band, Envelopes, check_acquisition, design_band, envelopes_of
 from ModuleUltrasoundLib.signal_forerun import Forerun, find_forerun, nominal_skin_s, steady, suppress_multiples
 
@@ -94,28 +94,35 @@ def search_lines(
     window = (depth_mm[0] / per_s, depth_mm[1] / per_s)
     band = design_band(acquisition, recording.lines.shape[1], nominal_skin_s(acquisition) * 1.04 + window[1] + BEHIND_S)
     search = Search(acquisition, speed_m_s, window, band, several_spots, rank)
-    parts = np.array_split(recording.lines, max(-(-len(recording) // CHUNK), 1))
+    batches = max(-(-len(recording) // CHUNK), 1)
+    parts = np.array_split(recording.lines, batches) if batches > 1 else [recording.lines]
     found = [_search_batch(lines, search) for lines in parts]
     candidates = concatenate([part.candidates for part in found])
-    forerun = Forerun(
-        **{name: np.concatenate([getattr(part.forerun, name) for part in found]) for name in Forerun.__dataclass_fields__}
-    )
-    calm = steady(forerun)
-    candidates = replace(candidates, delays_s=candidates.delays_s + (forerun.skin_s - calm.skin_s)[:, None])
-    turned = 2 * np.pi * band.carrier_hz * (calm.skin_s - forerun.skin_s)
+    forerun = Forerun(**{name: _joined([part.forerun for part in found], name) for name in Forerun.__dataclass_fields__})
+    phases, calm = _joined(found, "forerun_phases"), steady(forerun)
+    if calm is not forerun:
+        earlier = forerun.skin_s - calm.skin_s
+        candidates = replace(candidates, delays_s=candidates.delays_s + earlier[:, None])
+        phases = phases - np.where(calm.found, 2 * np.pi * band.carrier_hz * earlier, 0.0)
     bang = np.sum([part.bang for part in found], axis=0) / max(len(recording), 1)
     return Found(
         candidates,
         calm,
-        np.concatenate([part.forerun_phases for part in found]) + np.where(calm.found, turned, 0.0),
-        np.concatenate([part.features for part in found]),
-        np.concatenate([part.scores for part in found]),
+        phases,
+        _joined(found, "features"),
+        _joined(found, "scores"),
         candidates.delays_s * per_s,
-        np.concatenate([part.windows for part in found]),
+        _joined(found, "windows"),
         np.asarray(bang, dtype=np.complex128),
         band.rate_hz,
         band.carrier_hz,
     )
+
+
+def _joined(parts: Sequence[object], name: str) -> Any:
+    """The arrays of this name in all parts, one behind the other."""
+    arrays = [getattr(part, name) for part in parts]
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
 def _search_batch(lines: npt.NDArray[np.int16], search: Search) -> Found:
@@ -151,14 +158,15 @@ def _search_batch(lines: npt.NDArray[np.int16], search: Search) -> Found:
 
 def _forerun_phases(envelopes: Envelopes, forerun: Forerun) -> Array:
     """Phase of each line's forerun echo at its centre, rad; 0 where none was found."""
-    at = np.rint(forerun.skin_s * envelopes.rate_hz).astype(np.int64)[:, None]
-    values = np.take_along_axis(envelopes.values, np.minimum(at, envelopes.values.shape[1] - 1), axis=1)[:, 0]
+    at = np.rint(forerun.skin_s * envelopes.rate_hz).astype(np.int64)
+    values = at_samples(envelopes.values, np.minimum(at, envelopes.values.shape[1] - 1))
     return np.where(forerun.found, np.angle(values) + 2 * np.pi * envelopes.carrier_hz * forerun.skin_s, 0.0)
 
 
 def _cut_windows(envelopes: Envelopes, times_s: Array) -> Complexes:
     """Complex envelope (n, KEPT, W) around times (n, KEPT); beyond the line's ends its last sample repeats."""
-    count = times_s.shape[0]
-    centre = np.rint(np.nan_to_num(times_s) * envelopes.rate_hz).astype(np.int64)
-    index = np.clip(centre[..., None] + np.arange(-BEFORE, BEHIND + 1), 0, envelopes.values.shape[1] - 1)
-    return np.asarray(envelopes.values[np.arange(count)[:, None, None], index])
+    values = envelopes.values
+    centre = np.rint(without_nan(times_s) * envelopes.rate_hz).astype(np.int64)
+    index = clip(centre[..., None] + np.arange(-BEFORE, BEHIND + 1), 0, values.shape[1] - 1)
+    index += np.arange(0, values.size, values.shape[1])[:, None, None]
+    return np.asarray(values.reshape(-1).take(index))

@@ -36,3 +36,8 @@ def median(values: npt.NDArray[np.floating[Any]]) -> float:
 def pick(values: npt.NDArray[Scalar], index: npt.NDArray[np.int64]) -> npt.NDArray[Scalar]:
     """The columns `index` (n, K) of each row of values (n, M, ...)."""
     return np.asarray(values[np.arange(len(values))[:, None], index])
+
+
+def at_samples(values: npt.NDArray[Scalar], samples: npt.NDArray[np.int64]) -> npt.NDArray[Scalar]:
+    """Samples (..., n) of each line of values (n, M)."""
+    return np.asarray(values.reshape(-1).take(samples + np.arange(0, values.size, values.shape[1])))

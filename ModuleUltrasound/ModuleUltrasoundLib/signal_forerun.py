@@ -15,6 +15,7 @@ from CranioNavLib.sequence_metafile import Acquisition
 
 from ModuleUltrasoundLib.echo_candidates import fit_tops
 from ModuleUltrasoundLib.echo_timing import shift_windows
+from ModuleUltrasoundLib.lean import at_samples, median
 from ModuleUltrasoundLib.signal_chain import Envelopes
 
 SEARCH = 0.04  # of the nominal time: temperature changes the delay line's speed by 1 to 3 %, and its length is machined
@@ -76,19 +77,19 @@ def find_forerun(envelopes: Envelopes, magnitude: npt.NDArray[np.float32], noise
     samples = (peak * window * prior).argmax(axis=1)[:, None] + first
     positions, heights, widths = (values[:, 0] for values in fit_tops(magnitude, samples))
     guard = int(PULSE_CYCLES / acquisition.transducer_hz * rate)
-    index = np.minimum(samples + guard + np.arange(0, int(BEHIND_S * rate), 2), length - 1)
-    behind = np.exp(np.log(np.take_along_axis(magnitude, index, axis=1) + 1e-3).mean(axis=1))
+    index = np.minimum(samples[:, 0] + (guard + np.arange(0, int(BEHIND_S * rate), 2))[:, None], length - 1)
+    behind = np.exp(np.log(at_samples(magnitude, index) + 1e-3).mean(axis=0))
     times = positions / rate
     expected = (times > nominal - 0.3 / acquisition.transducer_hz) & (times < nominal + 1.5 / acquisition.transducer_hz)
     inside = (samples[:, 0] > first) & (samples[:, 0] < last - 1)
     found = inside & (heights > LEAST_SNR * noise) & (heights > np.where(expected, CONTRAST_EXPECTED, CONTRAST) * behind)
     if not found.any():
         return nothing
-    middle = float(np.median(times[found]))
+    middle = median(times[found])
     found &= np.abs(times - middle) < SAME_S
     if found.sum() < LEAST_SHARE * count:
         return nothing
-    middle = float(np.median(times[found]))
+    middle = median(times[found])
     sd = np.where(found, widths / rate * noise / np.maximum(heights, 1e-9), SAME_S / 2)
     return Forerun(np.where(found, times, middle), np.where(found, heights, 0.0), found, ~false, sd)
 
@@ -105,8 +106,8 @@ def steady(forerun: Forerun) -> Forerun:
     times, variance = forerun.skin_s[seen], forerun.sd_s[seen] ** 2
     weight = 1 / variance
     mean = _running(weight * times, NEIGHBOURS) / _running(weight, NEIGHBOURS)
-    noise = float(np.median(variance))
-    scatter = (MEDIAN_TO_SD * float(np.median(np.abs(times - mean)))) ** 2
+    noise = median(variance)
+    scatter = (MEDIAN_TO_SD * median(np.abs(times - mean))) ** 2
     own = max(scatter - noise, 0.0) / max(scatter, noise)  # share of the scatter that is not noise
     drawn = mean + own * (times - mean)
     rest = own**2 * variance + (1 - own) ** 2 / _running(weight, NEIGHBOURS)
