@@ -1,6 +1,6 @@
 """The workstation's speed, measured in the browser: start, CT and bone, pose to picture, stalls, memory.
 
-    python Testing/Benchmarks/workstation.py [start] [ct] [latency] [memory] [--minutes 10] [--runs 5]
+    python Testing/Benchmarks/workstation.py [start] [ct] [latency] [memory] [--minutes 10] [--runs 5] [--rate 60]
 
 Each picture that the server sends carries the time at which the pose that it shows was taken (8 bytes behind the JPEG, which
 decoders leave alone), and the page notes when the frame is done in which it was drawn. Server and browser share one computer
@@ -208,11 +208,11 @@ def write_large_ct(path: Path) -> None:
     sitk.WriteImage(finer, str(path))
 
 
-def measure_latency(seconds: float) -> None:
+def measure_latency(seconds: float, rate_hz: float) -> None:
     """From a pose taken to the picture that shows it, in each view, while the stylus visits the targets."""
     with tempfile.TemporaryDirectory() as scratch:
         with served(Path(scratch) / "session") as (url, process, log), watched_browser() as user:
-            navigate(user, url)
+            navigate(user, url, rate_hz)
             user.page.wait_for_timeout(3000)
             user.page.evaluate("window.seenPictures.length = 0")
             used, begun = _cpu_s(process.pid), time.monotonic()
@@ -227,7 +227,7 @@ def measure_latency(seconds: float) -> None:
                 f"view {view + 1}: pose to picture {np.median(waits):.0f} ms median, {np.percentile(waits, 95):.0f} ms 95%, "
                 f"{len(new) / seconds:.1f} pictures a second, {int(new[-1, 3])} pixels"
             )
-        print(f"(limit 100 ms and 20 a second; the server used {share:.2f} cores; {load()})")
+        print(f"(limit 100 ms and 20 a second; {rate_hz:g} poses a second; the server used {share:.2f} cores; {load()})")
         print(f"longest stall of the interface in the whole run: {longest_stall(log)}")
 
 
@@ -256,8 +256,8 @@ def measure_memory(minutes: float) -> None:
         )
 
 
-def navigate(user: Any, url: str) -> None:
-    """Click through to navigation by landmarks alone, and let the stylus travel."""
+def navigate(user: Any, url: str, rate_hz: float = 0.0) -> None:
+    """Click through to navigation by landmarks alone, and let the stylus travel; with as many poses a second as wanted."""
     user.open(url)
     user.press("ct", "layPatient")
     user.sees("ct", "simulated patient: sample head")
@@ -265,6 +265,10 @@ def navigate(user: Any, url: str) -> None:
     user.press("bone", "segmentBone")
     user.sees("bone", "on the outer table")
     user.next("bone")
+    if rate_hz:
+        user.page.locator("[data-panel=devices] .v-expansion-panel-title").first.click()
+        user.page.get_by_label("rate hz").fill(f"{rate_hz:g}")
+        user.page.get_by_label("rate hz").press("Enter")
     user.press("devices", "connect", 0)
     user.sees("devices", r"\d+ frames a second")
     user.step("landmarks")
@@ -328,12 +332,13 @@ def main() -> None:
     parser.add_argument("what", nargs="*", help="start, ct, latency, memory; all by default")
     parser.add_argument("--runs", type=int, default=5, help="of the start")
     parser.add_argument("--seconds", type=float, default=20.0, help="of tracking, for the latency")
+    parser.add_argument("--rate", type=float, default=60.0, help="poses a second, for the latency: 60 is usual for a Polaris")
     parser.add_argument("--minutes", type=float, default=10.0, help="of tracking, for the memory")
     wanted = parser.parse_args()
     measurements = {
         "start": lambda: measure_start(wanted.runs),
         "ct": measure_ct,
-        "latency": lambda: measure_latency(wanted.seconds),
+        "latency": lambda: measure_latency(wanted.seconds, wanted.rate),
         "memory": lambda: measure_memory(wanted.minutes),
     }
     for name in wanted.what or measurements:
