@@ -49,16 +49,20 @@ class Timing:
 
 def shift_windows(windows: Complexes, offset: Array) -> Complexes:
     """Windows (n, W) moved earlier by `offset` (n,) samples, |offset| < 2, by cubic interpolation; the ends repeat."""
+    return shift_columns(np.ascontiguousarray(windows.T), offset).T
+
+
+def shift_columns(windows: Complexes, offset: Array) -> Complexes:
+    """As shift_windows for windows (W, n): with many of them numpy's inner loops are longer so."""
     whole = np.floor(offset)
     part = (offset - whole).astype(np.float32)
-    count, length = windows.shape
-    # the lines are the last axis inside: numpy's inner loops then run over many of them
+    length, count = windows.shape
     index = clip(whole.astype(np.int64) + np.arange(-1, length + 2)[:, None], 0, length - 1)
-    near = windows.reshape(-1).take(index + np.arange(0, count * length, length))
+    near = windows.reshape(-1).take(index * count + np.arange(count))
     a, b, c, d = near[:-3], near[1:-2], near[2:-1], near[3:]
     moved = (0.5 * part) * ((c - a) + part * ((2 * a - 5 * b + 4 * c - d) + part * (3 * (b - c) + d - a)))
     moved += b
-    return np.asarray(moved.T, dtype=np.complex64)
+    return np.asarray(moved, dtype=np.complex64)
 
 
 def learn_pulse(windows: Complexes, offset: Array, chance: Array, rate_hz: float, transducer_hz: float) -> Pulse:
@@ -85,27 +89,27 @@ def fit_echoes(windows: Complexes, offset: Array, pulse: Pulse) -> tuple[Array, 
     w = pulse.values[BEFORE - CORE : BEFORE + CORE + 1].astype(np.complex64)
     slope = (pulse.values[BEFORE - CORE + 1 : BEFORE + CORE + 2] - pulse.values[BEFORE - CORE - 1 : BEFORE + CORE]) / 2
     slope = slope.astype(np.complex64)
-    windows = np.ascontiguousarray(windows[:, BEFORE - CORE - MARGIN : BEFORE + CORE + 1 + MARGIN])
+    windows = np.ascontiguousarray(windows[:, BEFORE - CORE - MARGIN : BEFORE + CORE + 1 + MARGIN].T)
     core = slice(MARGIN, MARGIN + 2 * CORE + 1)
-    shift: Array = np.zeros(len(windows))
+    shift: Array = np.zeros(windows.shape[1])
     own, mixed, other = complex(np.vdot(w, w)), complex(np.vdot(w, slope)), complex(np.vdot(slope, slope))
     inverse = np.array([[other, -mixed], [-mixed.conjugate(), own]]) / (own * other - abs(mixed) ** 2)
-    both = np.stack([w.conj(), slope.conj()], axis=1)
+    both = np.stack([w.conj(), slope.conj()])
     for _ in range(2):
-        y = shift_windows(windows, clip(offset + shift, -1.5, 1.5))[:, core]
-        amplitude, along = inverse @ (y @ both).T
+        y = shift_columns(windows, clip(offset + shift, -1.5, 1.5))[core]
+        amplitude, along = inverse @ (both @ y)
         amplitude[amplitude == 0] = 1
         shift = clip(shift + clip(-(along / amplitude).real, -0.5, 0.5), -1.0, 1.0)
-    y = shift_windows(windows, clip(offset + shift, -1.5, 1.5))[:, core]
-    amplitude = (y @ w.conj()) / np.vdot(w, w).real
-    rest = (np.abs(y - amplitude[:, None] * w) ** 2).sum(axis=1)
+    y = shift_columns(windows, clip(offset + shift, -1.5, 1.5))[core]
+    amplitude = (w.conj() @ y) / np.vdot(w, w).real
+    rest = (np.abs(y - amplitude * w[:, None]) ** 2).sum(axis=0)
     # neighbouring samples of the band-passed noise are alike: about half of them count (4 samples a cycle, 2 independent)
     quadrature = rest / (2 * max(CORE - 1, 1))
     power = np.maximum(np.abs(amplitude) ** 2, 1e-12)
     correlated = 2.0
     shift_sd = np.sqrt(correlated * quadrature / power * inverse[1, 1].real)
     phase_sd = np.sqrt(correlated * quadrature / power / np.vdot(w, w).real)
-    misfit = rest / np.maximum((np.abs(y) ** 2).sum(axis=1), 1e-12)
+    misfit = rest / np.maximum((np.abs(y) ** 2).sum(axis=0), 1e-12)
     phase = np.asarray(np.angle(amplitude), dtype=np.float64)
     return np.asarray(shift), shift_sd, phase, phase_sd, misfit
 

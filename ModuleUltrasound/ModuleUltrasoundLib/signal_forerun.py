@@ -14,8 +14,8 @@ from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Acquisition
 
 from ModuleUltrasoundLib.echo_candidates import fit_tops
-from ModuleUltrasoundLib.echo_timing import shift_windows
-from ModuleUltrasoundLib.lean import at_samples, median
+from ModuleUltrasoundLib.echo_timing import shift_columns
+from ModuleUltrasoundLib.lean import at_samples, clip, median
 from ModuleUltrasoundLib.signal_chain import Envelopes
 
 SEARCH = 0.04  # of the nominal time: temperature changes the delay line's speed by 1 to 3 %, and its length is machined
@@ -139,62 +139,66 @@ def suppress_multiples(
     lines = np.flatnonzero(forerun.found)
     if len(lines) < LEAST_LINES:
         return
-    window = np.arange(-half, half + 1)
+    window = np.arange(-half, half + 1)[:, None]  # the lines are the last axis: numpy's inner loops are longer so
     first = np.rint(forerun.skin_s[lines] * rate).astype(np.int64)
-    rows, values = lines[:, None], envelopes.values
     reach = int(SEARCH_S * rate)
     if first.min() < half:
         return
-    pulse = values[rows, first[:, None] + window]
-    late = (
-        rate * _running(forerun.skin_s[lines], NEIGHBOURS) / _running(np.ones(len(lines)), NEIGHBOURS)
-    )  # free of trigger jitter
+    size = envelopes.values.shape[1]
+    rows = lines * size
+    pulse = envelopes.values.take(rows + first + window)
+    # free of trigger jitter
+    late = rate * _running(forerun.skin_s[lines], NEIGHBOURS) / _running(np.ones(len(lines)), NEIGHBOURS)
     for number in range(2, MULTIPLES + 1):
         # the first echo's centre stands at the nominal time plus the pulse's delay, which the multiple carries once only
         lag = np.rint(late * (number - 1)).astype(np.int64)
         rounded = late * (number - 1) - lag
-        if (first + lag).max() + half + 1 >= envelopes.values.shape[1]:
+        if (first + lag).max() + half + 1 >= size:
             break
-        lag += _best_shift(values, rows, first + lag, pulse, window, reach)
-        place = (first + lag)[:, None] + window
-        turn = np.exp(-2j * np.pi * carrier * (lag + rounded) / rate).astype(np.complex64)[:, None]  # of the carrier's phase
-        there = values[rows, place] / turn
-        moved = shift_windows(pulse, -_offset(there, pulse, rounded))
-        strength = (there * moved.conj()).sum(axis=1) / (np.abs(moved) ** 2).sum(axis=1)
-        typical = complex(np.median(strength.real), np.median(strength.imag))
+        lag += _best_shift(envelopes.values, lines, first + lag, pulse, reach)
+        place = rows + first + lag + window
+        turn = np.exp(-2j * np.pi * carrier * (lag + rounded) / rate).astype(np.complex64)  # of the carrier's phase
+        there = envelopes.values.take(place) / turn
+        moved = shift_columns(pulse, -_offset(there, pulse, rounded))
+        strength = _share(there, moved)
+        typical = complex(median(strength.real), median(strength.imag))
         coherence = np.abs(np.mean(strength / (np.abs(strength) + 1e-12)))
         if coherence < LEAST_COHERENCE or abs(typical) > 1:
             continue
         cleaned = (there - np.complex64(typical) * moved) * turn
-        values[rows, place] = cleaned
-        magnitude[rows, place] = np.abs(cleaned)
+        np.put(envelopes.values, place, cleaned)
+        np.put(magnitude, place, np.abs(cleaned))
+
+
+def _share(there: npt.NDArray[np.complex64], pulse: npt.NDArray[np.complex64]) -> npt.NDArray[np.complex64]:
+    """How much of each `pulse` (W, n) there is in each window (W, n), shape (n,)."""
+    return np.asarray((there * pulse.conj()).sum(axis=0) / (np.abs(pulse) ** 2).sum(axis=0))
 
 
 def _offset(there: npt.NDArray[np.complex64], pulse: npt.NDArray[np.complex64], rounded: Array) -> Array:
-    """How many samples (n,) the pulse stands behind the middle of each line's window, less than one: what is common to all
-    lines (the pulse's own delay) and what each line's place was `rounded` by."""
-    slope = np.gradient(pulse, axis=1)
-    each = (pulse.conj() * there).sum(axis=1) / (np.abs(pulse) ** 2).sum(axis=1)
-    typical = complex(np.median(each.real), np.median(each.imag)) or 1.0
+    """How many samples (n,) the pulse (W, n) stands behind the middle of each line's window, less than one: what is common to
+    all lines (the pulse's own delay) and what each line's place was `rounded` by."""
+    slope = np.gradient(pulse, axis=0)
+    each = _share(there, pulse)
+    typical = complex(median(each.real), median(each.imag)) or 1.0
     rest = there / np.complex64(typical) - pulse
-    steps = -(slope.conj() * rest).sum(axis=1).real / np.maximum((np.abs(slope) ** 2).sum(axis=1), 1e-12)
-    common = float(np.median(steps - rounded))
-    return np.asarray(np.clip(common + rounded, -1.0, 1.0), dtype=np.float64)
+    steps = -(slope.conj() * rest).sum(axis=0).real / np.maximum((np.abs(slope) ** 2).sum(axis=0), 1e-12)
+    return clip(median(steps - rounded) + rounded, -1.0, 1.0)
 
 
 def _best_shift(
     values: npt.NDArray[np.complex64],
-    rows: npt.NDArray[np.int64],
+    lines: npt.NDArray[np.int64],
     starts: npt.NDArray[np.int64],
     pulse: npt.NDArray[np.complex64],
-    window: npt.NDArray[np.int64],
     reach: int,
 ) -> int:
-    """The shift (samples, at most 0) common to all lines at which the pulse fits best; it takes up the pulse's delay."""
+    """The shift (samples, at most 0) common to all lines at which the pulse (W, n) fits best; it takes up the pulse's delay."""
     shifts = range(-reach, 1)
     some = slice(None, None, max(len(starts) // 32, 1))  # the shift is the pulse's: a few lines tell it
-    wide = np.arange(window[0] - reach, window[-1] + 1)
-    there = values[rows[some], np.clip(starts[some, None] + wide, 0, values.shape[1] - 1)]
-    size = len(window)
-    scores = [np.abs((there[:, reach + s : reach + s + size] * pulse[some].conj()).sum(axis=1)).mean() for s in shifts]
+    size = len(pulse)
+    wide = np.arange(-(size // 2) - reach, size // 2 + 1)[:, None]
+    there = values[lines[some], np.minimum(np.maximum(starts[some] + wide, 0), values.shape[1] - 1)]
+    few = pulse[:, some].conj()
+    scores = [np.abs((there[reach + s : reach + s + size] * few).sum(axis=0)).mean() for s in shifts]
     return int(shifts[int(np.argmax(scores))])
