@@ -195,17 +195,21 @@ def run(surface: Surface, trials: int, landmark_sd_mm: float, with_trimesh: bool
     """One row a method."""
     head, rows = Head(surface), []
     for name, build in contestants(surface, with_trimesh).items():
-        indexed = fresh(surface)
-        started = time.perf_counter()
-        solve = build()
-        solve(head.trial(0, landmark_sd_mm, indexed).problem)
-        first_ms = 1e3 * (time.perf_counter() - started)
-        errors, times, bounds = [], [], []
+        first_ms = np.inf
+        for _ in range(2):  # the first of them imports the library, too
+            indexed = fresh(surface)
+            problem = head.trial(0, landmark_sd_mm, indexed).problem
+            started = time.perf_counter()
+            solve = build()
+            solve(problem)
+            first_ms = min(first_ms, 1e3 * (time.perf_counter() - started))
+        errors, times, cpu_times, bounds = [], [], [], []
         for seed in range(trials):
             trial = head.trial(seed, landmark_sd_mm, indexed)
-            started = time.perf_counter()
+            started, cpu_started = time.perf_counter(), time.process_time()
             pose = solve(trial.problem)
             times.append(1e3 * (time.perf_counter() - started))
+            cpu_times.append(1e3 * (time.process_time() - cpu_started))
             errors.append(head.tre(trial, pose))
             bounds.append(trial.bound_mm)
         rows.append(
@@ -219,38 +223,61 @@ def run(surface: Surface, trials: int, landmark_sd_mm: float, with_trimesh: bool
                 "trials": trials,
                 "cramer_rao_mm": float(np.mean(bounds)),
                 "median_ms": float(np.median(times)),
+                "median_cpu_ms": float(np.median(cpu_times)),
                 "first_call_with_index_ms": first_ms,
             }
         )
         print(
             f"{name:36s} TRE {rows[-1]['tre_mean_mm']:6.2f} / {rows[-1]['tre_sd_mm']:5.2f} / {rows[-1]['tre_max_mm']:6.2f} mm, "
             f"above 3 mm {rows[-1]['above_3mm']}/{trials}, bound {rows[-1]['cramer_rao_mm']:.2f} mm, "
-            f"{rows[-1]['median_ms']:7.1f} ms, first call {first_ms:7.1f} ms",
+            f"{rows[-1]['median_ms']:7.1f} ms ({rows[-1]['median_cpu_ms']:.1f} of the processor), with index {first_ms:7.1f} ms",
             flush=True,
         )
     return rows
 
 
-def plot(rows: list[dict[str, float | str]], path: Path) -> None:
-    """TRE over time a registration, one marker a method and landmark error; the bound as a line."""
+def plot(rows: list[dict[str, float | str]], triangles: int, path: Path) -> None:
+    """A line for each method: TRE beside the bound, failures, time with and without the index; a colour a landmark error."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     from matplotlib import pyplot
+    from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullLocator
 
-    figure, axes = pyplot.subplots(figsize=(9, 5.5))
+    methods = list(dict.fromkeys(str(row["method"]) for row in rows))
     levels = sorted({float(row["landmark_sd_mm"]) for row in rows})
-    colours = dict(zip(dict.fromkeys(row["method"] for row in rows), pyplot.get_cmap("tab10").colors))
+    figure, (tre, failed, speed) = pyplot.subplots(
+        1, 3, figsize=(12, 1.6 + 0.42 * len(methods)), sharey=True, width_ratios=(3, 1.5, 3), layout="constrained"
+    )
     for row in rows:
-        marker = "os^"[levels.index(float(row["landmark_sd_mm"]))]
-        axes.scatter(row["median_ms"], row["tre_mean_mm"], color=colours[row["method"]], marker=marker, s=70)
-    for method, colour in colours.items():
-        axes.scatter([], [], color=colour, label=method)
-    axes.axhline(float(rows[0]["cramer_rao_mm"]), color="0.4", linestyle="--", label="Cramer-Rao bound")
-    axes.set(xscale="log", yscale="log", xlabel="time of one registration, index built (ms)", ylabel="mean TRE (mm), simulated")
-    axes.set_title("18 points; landmark SD per axis: " + ", ".join(f"{m} {x:g} mm" for m, x in zip("os^", levels)))
-    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1))
-    figure.savefig(path, dpi=130, bbox_inches="tight")
+        level = levels.index(float(row["landmark_sd_mm"]))
+        colour, place = f"C{level}", methods.index(str(row["method"])) + 0.28 * (level - (len(levels) - 1) / 2)
+        mean, worst = float(row["tre_mean_mm"]), float(row["tre_max_mm"])
+        tre.plot([mean, worst], [place, place], color=colour, linewidth=1.5, alpha=0.5)
+        tre.plot(mean, place, "o", color=colour, markersize=6)
+        share = 100 * float(row["above_3mm"]) / float(row["trials"])
+        failed.barh(place, share, height=0.24, color=colour)
+        failed.text(share + 2, place, f"{share:.0f}", va="center", fontsize=8)
+        speed.plot([float(row["median_ms"]), float(row["first_call_with_index_ms"])], [place, place], color=colour, alpha=0.4)
+        speed.plot(float(row["median_ms"]), place, "o", color=colour, markersize=6)
+        speed.plot(float(row["first_call_with_index_ms"]), place, "o", color=colour, markersize=6, markerfacecolor="white")
+    for level, sd in enumerate(levels):
+        tre.plot([], [], "o", color=f"C{level}", label=f"landmarks {sd:g} mm (SD per axis)")
+    bound = float(rows[0]["cramer_rao_mm"])
+    tre.axvline(bound, color="0.4", linestyle="--", label=f"Cramer-Rao bound {bound:.2f} mm")
+    figure.legend(loc="outside lower left", ncols=len(levels) + 1, fontsize=9, frameon=False)
+    tre.set(xscale="log", xlabel="TRE (mm): mean, line to the largest", yticks=range(len(methods)), yticklabels=methods)
+    tre.xaxis.set_major_locator(FixedLocator([0.5, 1, 2, 5, 10, 20, 50]))
+    tre.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+    tre.xaxis.set_minor_locator(NullLocator())
+    failed.set(xlim=(0, 122), xticks=(0, 50, 100), xlabel="TRE above 3 mm (% of cases)")
+    speed.set(xscale="log", xlabel="one registration (ms): filled with the index built,\nhollow the first call, index included")
+    tre.invert_yaxis()
+    for axes in (tre, speed):
+        axes.grid(axis="x", color="0.9")
+        axes.set_axisbelow(True)
+    figure.suptitle(f"18 points, {triangles} triangles, {rows[0]['trials']} simulated cases", fontsize=11)
+    figure.savefig(path, dpi=130)
 
 
 def main() -> None:
@@ -278,7 +305,7 @@ def main() -> None:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    plot(rows, options.output / "registration.png")
+    plot(rows, len(surface.triangles), options.output / "registration.png")
 
 
 if __name__ == "__main__":
