@@ -19,7 +19,7 @@ from CranioNavLib.rigid import Array
 from ModuleUltrasoundLib.echo_candidates import DECIBEL, Candidates
 from ModuleUltrasoundLib.echo_network import Likelihood, probabilities
 from ModuleUltrasoundLib.echo_search import Found
-from ModuleUltrasoundLib.lean import without_nan
+from ModuleUltrasoundLib.lean import product, without_nan
 
 SAME_MM = 0.35  # SD of a hand's tremor along the beam from line to line: how near candidates support each other
 BIN_MM = 0.2
@@ -201,7 +201,7 @@ class DepthMap:
         count, size = self.values.shape
         if count < 2:
             return [np.zeros(self.bins.T.shape) for _ in among]
-        blurred = self.values @ _blur(-(-size // BLUR_STEP) * BLUR_STEP, same_mm)[:size, :size]
+        blurred = product(self.values, _blur(-(-size // BLUR_STEP) * BLUR_STEP, same_mm)[:size, :size])
         flat = blurred[:0] if among == (None,) else running_sums(blurred).reshape(-1)
         column, row = np.maximum(self.bins, 0), np.arange(0, count * size, size)
         own = blurred.reshape(-1).take(column + row)

@@ -20,6 +20,7 @@ Complexes = npt.NDArray[np.complex64]
 BEFORE, BEHIND = 10, 16  # samples of an echo's window before and behind its peak (4 a cycle of the transducer)
 CORE = 5  # samples on each side of the peak that are fitted: what follows or comes before may be another interface
 MARGIN = 4  # samples beyond the core that the interpolation reaches
+BLOCK = 512  # lines fitted at once: they stay in the processor's cache, and their matrix products on one thread
 LEAST_LINES = 5  # echoes from which a pulse is learnt; below, a Gaussian of the typical width stands in
 SURE = 0.9  # probability of an echo that may teach the pulse
 STEADY = 0.8  # mean resultant length of the phases from which on the phase is trusted
@@ -95,13 +96,14 @@ def fit_echoes(windows: Complexes, offset: Array, pulse: Pulse) -> tuple[Array, 
     own, mixed, other = complex(np.vdot(w, w)), complex(np.vdot(w, slope)), complex(np.vdot(slope, slope))
     inverse = np.array([[other, -mixed], [-mixed.conjugate(), own]]) / (own * other - abs(mixed) ** 2)
     both = np.stack([w.conj(), slope.conj()])
+    # einsum stays on this thread; a matrix product of complex numbers would be spread over several, however small it is
     for _ in range(2):
         y = shift_columns(windows, clip(offset + shift, -1.5, 1.5))[core]
-        amplitude, along = inverse @ (both @ y)
+        amplitude, along = np.einsum("ji,in->jn", inverse @ both, y)
         amplitude[amplitude == 0] = 1
         shift = clip(shift + clip(-(along / amplitude).real, -0.5, 0.5), -1.0, 1.0)
     y = shift_columns(windows, clip(offset + shift, -1.5, 1.5))[core]
-    amplitude = (w.conj() @ y) / np.vdot(w, w).real
+    amplitude = np.einsum("i,in->n", both[0], y) / own.real
     rest = (np.abs(y - amplitude * w[:, None]) ** 2).sum(axis=0)
     # neighbouring samples of the band-passed noise are alike: about half of them count (4 samples a cycle, 2 independent)
     quadrature = rest / (2 * max(CORE - 1, 1))
@@ -135,7 +137,8 @@ def time_echoes(
     times = np.where(good, peaks_s, 0.0)
     offset = times * rate_hz - np.rint(times * rate_hz)
     pulse = learn_pulse(windows, offset, np.where(good, chance, 0.0), rate_hz, transducer_hz)
-    shift, sd, phase, phase_sd, misfit = fit_echoes(windows, offset, pulse)
+    pieces = [slice(start, start + BLOCK) for start in range(0, max(len(windows), 1), BLOCK)]
+    shift, sd, phase, phase_sd, misfit = np.concatenate([fit_echoes(windows[k], offset[k], pulse) for k in pieces], axis=1)
     absolute = phase + 2 * np.pi * carrier_hz * (times + shift / rate_hz) - references
     middle, spread = common_phase(absolute, np.where(good, chance, 0.0))
     per_cycle = rate_hz / carrier_hz  # samples a cycle

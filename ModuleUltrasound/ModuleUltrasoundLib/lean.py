@@ -11,6 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+ONE_THREAD = 200_000  # products of numbers in a matrix product; OpenBLAS spreads larger ones, and its threads wait by spinning
+
 Number = TypeVar("Number", bound="np.number[Any]")
 Real = TypeVar("Real", bound="np.floating[Any]")
 Scalar = TypeVar("Scalar", bound="np.generic")
@@ -41,3 +43,13 @@ def pick(values: npt.NDArray[Scalar], index: npt.NDArray[np.int64]) -> npt.NDArr
 def at_samples(values: npt.NDArray[Scalar], samples: npt.NDArray[np.int64]) -> npt.NDArray[Scalar]:
     """Samples (..., n) of each line of values (n, M)."""
     return np.asarray(values.reshape(-1).take(samples + np.arange(0, values.size, values.shape[1])))
+
+
+def product(left: npt.NDArray[np.float32], right: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """left (n, M) @ right (M, K), piece by piece on this thread alone: others would have to wait for their share longer than
+    the work takes, and to keep a second core busy meanwhile."""
+    rows = max(ONE_THREAD // right.size, 1)
+    whole = np.empty((len(left), right.shape[1]), dtype=np.float32)
+    for start in range(0, len(left), rows):
+        np.matmul(left[start : start + rows], right, out=whole[start : start + rows])
+    return whole
