@@ -123,6 +123,7 @@ class Surface:
     def prepare(self) -> None:
         """Make now what is otherwise made on first use and takes seconds for a skull: where that disturbs nobody."""
         self.vertex_normals  # noqa: B018
+        self.triangle_normals  # noqa: B018
         self.closest(self.vertices_mm[:1])
 
     def closest(self, points_mm: npt.ArrayLike) -> ClosestPoints:

@@ -147,6 +147,27 @@ def a_bone(an_empty_scene):
     return copy
 
 
+def test_a_copy_is_made_elsewhere_and_shown_when_it_is_ready_unless_there_is_a_newer_bone(an_empty_scene):
+    from CranioNavLib.phantom import make_patient
+
+    bones, waiting = [make_patient(None, seed=seed).bone for seed in (1, 2)], []
+    copy = CoarseCopy("Bone", lambda compute, finished: waiting.append((compute, finished)))
+    model = scene_data.set_surface("Bone", bones[0])
+    assert not copy.refresh()  # it is being made
+    assert not copy.refresh()
+    scene_data.set_surface("Bone", bones[1])
+    assert not copy.refresh()
+    (old, take_old), (new, take_new) = waiting
+    take_old(old())
+    assert not copy.refresh()
+    assert copy.node is None
+    take_new(new())
+    assert copy.refresh()
+    assert not copy.refresh()
+    assert not model.GetDisplayNode().GetVisibility()
+    np.testing.assert_allclose(copy.node.GetPolyData().GetBounds(), model.GetPolyData().GetBounds(), atol=3.0)
+
+
 def test_the_expected_error_is_drawn_where_it_is_and_shrinks_with_points(an_empty_scene):
     """Translation alone: the same error everywhere; a rotation about the pivot: growing with the distance from it."""
     from ModuleRegistrationLib.registration.error_theory import predict_tre

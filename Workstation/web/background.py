@@ -17,6 +17,11 @@ def load_soon_needed() -> None:
     for name in SOON_NEEDED:
         importlib.import_module(name)
 
+    import numpy as np
+    from ModuleRegistrationLib.registration.error_theory import length_statistics
+
+    length_statistics(np.eye(3)[None])  # its tables are made on first use
+
 
 class BackgroundRunner:
     """Runs `compute` in a worker thread and `finished(result or exception)` in the server's event loop."""

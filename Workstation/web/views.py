@@ -23,7 +23,7 @@ class ViewFollower:
     def __init__(self, slicer_app: Any, start: Any) -> None:
         self._app = slicer_app
         self._framing = Framing(slicer_app.view_manager, self._bounds)
-        self._bone, self._skin = CoarseCopy("Bone"), CoarseCopy("Skin")
+        self._bone, self._skin = CoarseCopy("Bone", start), CoarseCopy("Skin", start)
         self._tools, self._ring = ToolModels(), ErrorRing()
         self._points, self._errors = PointStyles(), ErrorViews(start)
         self._image: Any = None
