@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Optional
 
@@ -10,7 +11,7 @@ from CranioNavLib import scene, scene_data
 from CranioNavLib.files import set_aside
 from CranioNavLib.module_logic import done_or
 from CranioNavLib.panel import Level, Reading, StepState, StepStatus, Task
-from CranioNavLib.rigid import invert_rigid, transform_points
+from CranioNavLib.rigid import Array, invert_rigid, transform_points
 
 from ModuleUltrasoundLib.line_stream import PosedLine
 from ModuleUltrasoundLib.logic.measuring import MeasureStep
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from ModuleUltrasoundLib.line_recorder import LineRecorder
     from ModuleUltrasoundLib.palpation import Palpation, PalpationStatus
 
+LEFT_MM = 10.0  # a resting probe wanders by 1 to 3 mm; the next point is centimetres away
 ENOUGH = 200  # points of a sweep after which stopping is suggested
 
 
@@ -33,6 +35,7 @@ class PalpationStep(SweepStep, MeasureStep):
         self.recorder: Optional[LineRecorder] = None
         self._palpated: Optional[PalpationStatus] = None  # its last status
         self._fedTime = 0.0  # time of the last line that palpation was given
+        self._rests: Optional[tuple[int, Array]] = None  # the point just taken, and where the probe stood then (Reference)
 
     def goTo(self, index: int) -> None:
         """Ask for a point; where it is expected on the patient follows from the registration, once there is one."""
@@ -81,10 +84,16 @@ class PalpationStep(SweepStep, MeasureStep):
         return "" if self.parameters().read().recording_path else "choose a file first"
 
     def record(self, posed: list[PosedLine]) -> None:
-        """Lines into the file, while there is a recording."""
-        if self.recorder is not None:
-            for item in posed:
-                self.recorder.add(item)
+        """Lines into the file, while there is a recording; a probe still on the point just taken is not on the next."""
+        if self.recorder is None:
+            return
+        for item in posed:
+            if self._rests is not None and item.pose.usable:
+                away_mm = float(np.linalg.norm(_origin(item) - self._rests[1]))
+                self._rests = self._rests if away_mm < LEFT_MM else None
+            if self._rests is not None and item.palpation_point >= 0:
+                item = replace(item, palpation_point=self._rests[0])
+            self.recorder.add(item)
 
     def stopRecording(self) -> Task:
         """Finish the file and measure it."""
@@ -100,7 +109,7 @@ class PalpationStep(SweepStep, MeasureStep):
         if self.recorder is not None:
             self.record(self.poser.ready(everything=True) if self.poser is not None else [])
             self.recorder.close()
-        self.recorder = self.palpation = self.sweep = self._palpated = None
+        self.recorder = self.palpation = self.sweep = self._palpated = self._rests = None
 
     def measureRecordingBlocked(self) -> str:
         """Why nothing can be measured now."""
@@ -125,6 +134,8 @@ class PalpationStep(SweepStep, MeasureStep):
             self._palpated = self.palpation.add(line)
             if self._palpated.new_point is not None:
                 new = True
+                resting = next((item for item in reversed(self.latest) if item.pose.usable), None)
+                self._rests = (self.palpation.taken[-1].target, _origin(resting)) if resting is not None else None
                 self.askNext()
         if new:
             self._showTaken(self.palpation)
@@ -191,3 +202,10 @@ class PalpationStep(SweepStep, MeasureStep):
             return StepStatus(StepState.ATTENTION, "all points are taken: stop the recording", "stopRecording")
         done = Path(self.parameters().read().recording_path).is_file()
         return done_or(done, self.startRecordingBlocked() or "record")
+
+
+def _origin(item: PosedLine) -> Array:
+    """(3,) where a line's probe stood, Reference."""
+    pose = item.pose.tool_to_tracker
+    assert pose is not None  # or it is not usable
+    return np.asarray(pose[:3, 3], dtype=float)

@@ -242,6 +242,21 @@ def test_resting_on_a_point_takes_it_and_asks_for_the_next(a_recording_logic):
     assert scene.find("SurfacePoints") is None
 
 
+def test_lines_of_a_probe_that_still_rests_on_a_taken_point_are_not_the_next_points(a_recording_logic, tmp_path):
+    logic, end = a_recording_logic, time.monotonic() + 15
+    while logic.currentIndex() == 0 and time.monotonic() < end:
+        run_for(logic, 0.2, on_point(logic, 0))
+    run_for(logic, 0.6, on_point(logic, 0))  # it rests on
+    run_for(logic, 0.6, on_point(logic, 1))
+    logic.closeRecording()
+    recording = read_recording(tmp_path / "r.igs.mha")
+    places = recording.probe_to_reference[:, :3, 3]
+    for number in (0, 1):
+        stood = np.linalg.norm(places - on_point(logic, number)[:3, 3], axis=1) < 1.0
+        assert stood.any()
+        assert set(recording.palpation_points[stood].tolist()) == {number}
+
+
 def know_the_error(logic):
     """The registration in force turns loosely about the left-right axis, and is sure of all else."""
     scene_data.set_motion_error(np.diag([0.05, 0.002, 0.002, 0.3, 0.3, 0.3]) ** 2, np.zeros(3), None)
