@@ -98,5 +98,5 @@ class BaseWatch:
         if self.result is not None:
             return self.result.message
         if self.point is None:
-            return self.refused or "no check point: a loose base would not be noticed"
+            return self.refused or "no check point is stored: without one (it is optional) a loose base is not noticed"
         return f"check point stored {self.point.date[:16].replace('T', ' ')} UTC, SD {self.point.sd_mm:.2f} mm; not checked since"

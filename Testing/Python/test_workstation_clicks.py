@@ -74,6 +74,13 @@ def test_landmarks_are_placed_moved_and_taken_back_in_the_views(tmp_path):
         user.sees("bone", "not placed: the click missed the head")
         click_in_view(user, 0, 0.45, 0.5)  # still asked for: a click in a slice places it
         in_slice = wait_until_saved(user, folder, lambda found: found["Nasion"] != on_head["Nasion"])
+        user.sees("bone", r"Nasion lies \d+ mm from skin and bone")  # in the head, where no landmark is
+        user.page.locator("[data-step=bone] [title='needs attention']").wait_for()
+        user.follow("bone", "moveToSurface")
+        on_bone = wait_until_saved(user, folder, lambda found: found["Nasion"] != in_slice["Nasion"])
+        user.page.locator("[data-step=bone] [title=done]").wait_for()
+        user.page.keyboard.press("Control+z")
+        assert wait_until_saved(user, folder, lambda found: found["Nasion"] != on_bone["Nasion"]) == in_slice
 
         user.page.keyboard.press("Control+z")
         assert wait_until_saved(user, folder, lambda found: found["Nasion"] != in_slice["Nasion"]) == on_head

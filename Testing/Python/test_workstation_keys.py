@@ -28,6 +28,8 @@ FOCUS = """() => {
   const wrong = [];
   if (!ringed(at) && !ringed(frame)) wrong.push('no ring');
   if (!there || !(frame.contains(there) || there.contains(frame))) wrong.push('not in sight');
+  const label = at.querySelector('.v-btn__content');
+  if (label && label.getBoundingClientRect().width > box.width) wrong.push('cut off');
   const name = at.innerText || at.getAttribute('aria-label') || at.title || (at.closest('[data-field]') || at).className;
   return { name: String(name).slice(0, 60), wrong, data: { ...at.dataset } };
 }"""
@@ -161,7 +163,8 @@ def test_the_whole_procedure_is_done_by_keys_alone(tmp_path):
         keys.enter("verification", "verify")
         user.sees("verification", r"TRE \d+\.\d+ mm \(mean\)")
         keys.next("verification", "navigation")
-        keys.enter("navigation", "tourTargets")
+        keys.tab_to(offer="tourTargets")
+        keys.keyboard.press("Enter")
         user.sees("navigation", r"To the bone\s+\d+\.\d mm")
         keys.goes_round("navigation")
         keys.keyboard.press("n")

@@ -211,6 +211,7 @@ def test_two_windows_share_a_session_and_survive_reload_and_a_pulled_cable(tmp_p
         other.open(url)
         link_of(other.page, "watches")
         assert "Window 1" in other.page.locator("[data-control]").inner_text()
+        assert other.page.locator("[data-control]").bounding_box()["y"] > 600, "it covers the views' lower edge, no button"
         other.page.evaluate(ASK_BEHIND_THE_PAGE)
         user.step("bone")
         other.page.locator("[data-panel=bone]").wait_for()

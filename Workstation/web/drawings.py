@@ -50,15 +50,15 @@ def a_line(logic: Any) -> dict[str, Any] | None:
     gate = (
         [x(skin_s + 2e-3 * mm / speed) for mm in (wanted.least_depth_mm, wanted.most_depth_mm)] if np.isfinite(skin_s) else None
     )
+    reason = measured.reasons[-1] or words.NO_ECHO
     return {
         "path": path,
         "skin": x(skin_s) if np.isfinite(skin_s) else None,
         "bone": x(skin_s + 2e-3 * depth / speed) if found else None,
         "gate": gate,
         "accepted": accepted,
-        "text": words.BONE_DEPTH.format(depth=depth)
-        if found and accepted
-        else reason_in_words(measured.reasons[-1] or words.NO_ECHO),
+        "text": words.BONE_DEPTH.format(depth=depth) if found and accepted else reason_in_words(reason),
+        "posed": reason != "pose missing",
     }
 
 

@@ -55,4 +55,5 @@ def draw_live(step: str) -> None:
                 html.Div(BULLS_EYE)
                 html.Div("{{ (live.eye.good ? '✓ ' : '! ') + live.eye.text }}", classes="text-h6")
         html.Div(A_LINE, v_if=wanted)
-        html.Div("{{ (live.line.accepted ? '' : '! ') + live.line.text }}", v_if=wanted, classes="text-h6")
+        said = wanted + (" && live.line.posed" if step == "devices" else "")  # the probe need not be in view yet
+        html.Div("{{ (live.line.accepted ? '' : '! ') + live.line.text }}", v_if=said, classes="text-h6")

@@ -40,6 +40,9 @@ html { overflow: hidden; }
 .buttons > .wide { flex-basis: 100%; }
 .buttons .v-btn { height: auto; min-height: 38px; padding: 6px 8px; }
 .buttons .v-btn__content { white-space: normal; line-height: 1.15; }
+.headline .v-btn { height: auto; min-height: 36px; max-width: 100%; padding: 6px 12px; }
+.headline .v-btn--size-small { min-height: 28px; padding: 3px 12px; }
+.headline .v-btn__content { white-space: normal; line-height: 1.15; }
 .headline .v-alert { border-radius: 4px; }
 .v-messages__message { line-height: 1.3; }
 .said { overflow-wrap: anywhere; max-height: 7.5em; overflow-y: auto; }
@@ -78,13 +81,13 @@ class Page:
                     client.ServerTemplate(name=(name,))
             with v3.VMain(style="height: 100vh;"), html.Div(classes="views"):
                 layouts.initialize_layout_grid(self.layout)
+            draw_link()
 
     def _draw_title(self, procedure: tuple[ProcedureStep, ...]) -> None:
         with v3.VAppBar(density="compact", flat=True, border=True):
             v3.VAppBarTitle(words.TITLE, style="flex: none")
             v3.VChip(words.SIMULATED, v_if="simulated", color="warning", variant="flat", size="small", classes="ml-3")
             v3.VSpacer()
-            draw_link()
             html.Div(words.DISCLAIMER, classes="text-body-2 text-medium-emphasis mr-4")
             draw_toolbar()
             draw_sounds()

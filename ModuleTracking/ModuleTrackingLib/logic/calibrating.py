@@ -29,7 +29,7 @@ class CalibrationStep(ToolsStep):
     def startPivot(self) -> str:
         """Collect poses of the chosen tool, tilted to all sides, for `pivot_s`; `poll` then calibrates its tip."""
         self._calibrate(Kind.PIVOT)
-        return f"pivot the {self._tool().lower()} for {self.parameters().read().pivot_s:.0f} s"
+        return f"poses of the {self._tool().lower()} are collected for {self.parameters().read().pivot_s:.0f} s"
 
     def startPivotBlocked(self) -> str:
         """Why no tool can be calibrated now."""

@@ -136,7 +136,8 @@ class ToolsStep(DeviceInScene[TrackingParameters, PoseStream]):
         if self.stream is None:
             return None
         pose = self.stream.current_in_reference(tool)
-        return Reading(pose.reason or pose.status.value, LEVELS.get(pose.status, Level.BAD))
+        lost = Level.BAD if self.tips.get(tool) else Level.PLAIN  # one that has not been shown yet is not lost
+        return Reading(pose.reason or pose.status.value, LEVELS.get(pose.status, lost))
 
     def trackerStatus(self) -> StepStatus:
         """Whether poses arrive."""

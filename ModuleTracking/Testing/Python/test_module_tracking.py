@@ -38,6 +38,7 @@ def test_a_lost_tool_has_no_pose_in_the_scene(a_logic):
     run_until(a_logic, lambda: scene_data.get_pose("StylusToReference").status == "MISSING")
     assert scene_data.get_pose("StylusToReference").matrix is None
     assert a_logic.stylusTool().level is Level.BAD
+    assert a_logic.probeTool().level is Level.PLAIN, "one that has not been shown yet is not lost"
 
 
 @pytest.mark.parametrize("silent", [("Reference", "Stylus", "Probe"), ("Stylus",)], ids=["nothing comes", "others go on"])
