@@ -19,7 +19,7 @@ from CranioNavLib.rigid import Array
 from ModuleUltrasoundLib.echo_candidates import DECIBEL, Candidates
 from ModuleUltrasoundLib.echo_network import Likelihood, probabilities
 from ModuleUltrasoundLib.echo_search import Found
-from ModuleUltrasoundLib.lean import product, without_nan
+from ModuleUltrasoundLib.lean import median, product, without_nan
 
 SAME_MM = 0.35  # SD of a hand's tremor along the beam from line to line: how near candidates support each other
 BIN_MM = 0.2
@@ -293,5 +293,5 @@ def contact(amplitude: Array) -> Array:
     seen = amplitude > 0
     if seen.sum() < LEAST_FOR_SHARED:
         return np.zeros(len(amplitude))
-    middle = float(np.median(amplitude[seen]))
+    middle = median(amplitude[seen])
     return np.where(seen, np.clip(DECIBEL * np.log(np.where(seen, amplitude, middle) / middle) / 10, -3, 3), 0.0)

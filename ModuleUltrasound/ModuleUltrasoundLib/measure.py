@@ -17,7 +17,7 @@ from ModuleUltrasoundLib.echo_network import Likelihood, learnt
 from ModuleUltrasoundLib.echo_onset import pulse_delay
 from ModuleUltrasoundLib.echo_search import Found, search_lines
 from ModuleUltrasoundLib.echo_timing import time_echoes
-from ModuleUltrasoundLib.lean import without_nan
+from ModuleUltrasoundLib.lean import median, without_nan
 from ModuleUltrasoundLib.measure_points import bone_points as bone_points
 from ModuleUltrasoundLib.quality import CLIPPED_SHARE, TOLERANCE_MM, choose, clipped_share, quality_of, reasons_of, unstable
 
@@ -80,8 +80,10 @@ def several_spots(recording: Recording, runs: npt.NDArray[np.int64]) -> bool:
         return False
     origin = recording.probe_to_reference[:, :3, 3]
     known = origin[np.isfinite(origin).all(axis=1)]
-    strayed = len(known) > 1 and float(np.linalg.norm(known - np.median(known, axis=0), axis=1).max()) > SAME_SPOT_MM
-    return bool(runs.max(initial=0) >= 2) or strayed
+    if len(known) < 2 or runs.max() >= 2:
+        return bool(runs.max() >= 2)
+    middle = np.array([median(along) for along in known.T])
+    return bool(np.linalg.norm(known - middle, axis=1).max() > SAME_SPOT_MM)
 
 
 def measure_lines(
