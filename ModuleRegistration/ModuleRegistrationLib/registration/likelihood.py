@@ -1,7 +1,8 @@
 """The likelihood of a pose given bone points, landmarks and what is common to all points. Batched over poses.
 
 A point's distance from the surface is Gaussian with a variance known up to a common factor, or, with a small
-probability, an outlier with heavy tails. Common to all points are an offset along the normal (threshold of the
+probability, an outlier: another interface some millimetres away, mostly outside the bone or on both sides alike, or a
+stray point. Common to all points are an offset along the normal (threshold of the
 CT, zero of the depth scale) and the relative error of the speed of sound; both have priors. The landmarks are
 Gaussian with an unknown SD whose prior is broad, which makes them Student-t together: poor landmarks lose their
 weight by themselves. Each unknown scale is solved for by expectation maximisation beside the pose's Gauss-Newton.
@@ -23,9 +24,10 @@ from ModuleRegistrationLib.registration.landmarks import motion_jacobian
 from ModuleRegistrationLib.registration.problem import RegistrationProblem
 
 PARAMETERS = 8  # rotation, translation, offset, speed
-OUTLIER_WIDTH_MM, OUTLIER_FREEDOM = 5.0, 3.0  # of Student's law of outliers: another tissue interface lies 2-8 mm away
-OUTLIER_PEAK = 2 / (np.pi * np.sqrt(3) * OUTLIER_WIDTH_MM)  # its density at 0
-OUTLIER_PRIOR = (0.5, 6.0)  # pseudo-counts of outliers and of points
+INTERFACE_MM, INTERFACE_SD_MM = 5.0, 2.2  # of most outliers: another tissue interface lies 2-8 mm away
+OUTSIDE_SHARES = (0.5, 0.9)  # of those outliers; which of the two, the points of a case tell
+STRAY_SHARE, STRAY_WIDTH_MM, STRAY_FREEDOM = 0.2, 8.0, 3.0  # of the other outliers, which follow Student's law
+OUTLIER_PRIOR = (1.0, 6.0)  # pseudo-counts of outliers and of points
 SCALE_FREEDOM = 6.0  # what the stated variances are worth, in points: right to a factor of two or so
 LEAST_SCALE = 0.2  # of the variances: nothing measures much better than it says
 LANDMARK_SD_MM, LANDMARK_FREEDOM = 2.5, 1.0  # per axis; the prior is so broad that 1 mm and 8 mm are both likely
@@ -156,16 +158,15 @@ def evaluate(model: Model, state: State) -> Evaluation:
     design[..., 3:6] = normals
     design[..., 6] = -1.0
     design[..., 7] = slope * model.depths
-    inlier, residuals, echoes, density = _inliers(model, state, residuals, variances, slope)
-    heavy = (OUTLIER_FREEDOM + 1) / (
-        OUTLIER_FREEDOM * OUTLIER_WIDTH_MM**2 + residuals**2
-    )  # an outlier still pulls a little: its law's own slope
+    inlier, residuals, echoes, log_likelihood = _inliers(model, state, residuals, variances, slope)
+    # an outlier still pulls a little, as a stray point does, so that a search far off finds its way
+    heavy = (STRAY_FREEDOM + 1) / (STRAY_FREEDOM * STRAY_WIDTH_MM**2 + residuals**2)
     weights = inlier / (state.scale[:, None] * variances) + (1 - inlier) * heavy
     moved = transform_points(state.motion, model.landmarks)
     misses = moved - model.landmarks_ct
     squares = (misses**2).sum(axis=(1, 2))
     total, believed = model.landmark_freedom + 3 * len(model.landmarks), model.landmark_freedom * model.landmark_sd**2
-    cost = -np.log(density).sum(axis=1) + total / 2 * np.log1p(squares / believed)
+    cost = total / 2 * np.log1p(squares / believed) - log_likelihood
     cost += _prior_cost(model, state)
     return Evaluation(
         cost=cost,
@@ -197,7 +198,7 @@ def _prior_cost(model: Model, state: State) -> Array:
 
 
 def _inliers(model: Model, state: State, residuals: Array, variances: Array, slope: Array) -> tuple[Array, Array, Array, Array]:
-    """Probability of being an inlier, residual of the believed echo, its distance from the chosen one, density; (M, N) each."""
+    """Probability of being an inlier, residual of the believed echo, its distance from the chosen one: (M, N); log likelihood."""
     echoes = np.zeros_like(residuals)
     spread = state.scale[:, None] * variances
     prior = (1 - state.outliers[:, None]) * model.inlier_prior
@@ -217,9 +218,23 @@ def _inliers(model: Model, state: State, residuals: Array, variances: Array, slo
     else:
         logarithm = -(residuals**2) / (2 * spread)
     good = prior * np.exp(np.maximum(logarithm, -600)) / np.sqrt(2 * np.pi * spread)
-    bad = (1 - prior) * OUTLIER_PEAK / (1 + residuals**2 / (OUTLIER_FREEDOM * OUTLIER_WIDTH_MM**2)) ** 2
-    density = good + bad
-    return good / density, residuals, echoes, density
+    outside, inside, stray = outlier_laws(residuals)
+    densities = [good + (1 - prior) * (share * outside + (1 - share) * inside + stray) for share in OUTSIDE_SHARES]
+    likelihoods = np.stack([np.log(density).sum(axis=1) for density in densities])
+    log_likelihood = np.asarray(np.logaddexp.reduce(likelihoods, axis=0), dtype=np.float64) - np.log(len(OUTSIDE_SHARES))
+    beliefs = np.exp(likelihoods - likelihoods.max(axis=0))
+    beliefs = (beliefs / beliefs.sum(axis=0))[..., None]
+    inlier: Array = sum((belief * good / density for belief, density in zip(beliefs, densities)), np.zeros_like(good))
+    return inlier, residuals, echoes, log_likelihood
+
+
+def outlier_laws(residuals: Array) -> tuple[Array, Array, Array]:
+    """Densities of an outlier's residual: at an interface outside the bone, at one inside, astray; with their shares."""
+    height = (1 - STRAY_SHARE) / (INTERFACE_SD_MM * np.sqrt(2 * np.pi))
+    outside = height * np.exp(-((residuals - INTERFACE_MM) ** 2) / (2 * INTERFACE_SD_MM**2))
+    inside = height * np.exp(-((residuals + INTERFACE_MM) ** 2) / (2 * INTERFACE_SD_MM**2))
+    peak = STRAY_SHARE * 2 / (np.pi * np.sqrt(3) * STRAY_WIDTH_MM)
+    return outside, inside, peak / (1 + residuals**2 / (STRAY_FREEDOM * STRAY_WIDTH_MM**2)) ** 2
 
 
 def normal_equations(model: Model, state: State, found: Evaluation) -> tuple[Array, Array]:

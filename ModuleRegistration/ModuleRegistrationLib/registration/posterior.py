@@ -14,6 +14,7 @@ import numpy.typing as npt
 import scipy
 from CranioNavLib.rigid import Array, invert_rigid, rigid_from_vector
 
+from ModuleRegistrationLib.registration.error_theory import length_statistics
 from ModuleRegistrationLib.registration.landmarks import motion_jacobian
 from ModuleRegistrationLib.registration.likelihood import OUTLIER_PRIOR, PARAMETERS, Model, State, evaluate
 
@@ -21,6 +22,8 @@ PROPOSAL_FREEDOM = 5.0  # tails of the proposal: heavier than the posterior's
 PROPOSAL_STRETCH = 1.3  # its width beside the curvature's
 LOG_SCALE_SD = 0.35  # of the proposal for the common factor on the variances
 WEISZFELD_STEPS, CORE_MM = 12, 0.3
+CAUTION = 0.9  # power of the posterior: real errors follow no model to the letter (Miller and Dunson, JASA 114, 2019)
+TOLD_SHARE, TOLD_AT = 0.95, 3  # share of the samples that the covariance's 95% limit holds, at every so many-th point
 LEAST_SHARE = 0.08  # of the samples that each minimum gets
 FOLLOWED = 20  # of the likeliest samples, where they are to be followed to a minimum that the search has not found
 
@@ -30,7 +33,7 @@ class Posterior:
     """Moments over the weighted samples, as a motion after the initial registration."""
 
     motion: Array  # (4, 4) geometric median
-    covariance: Array  # (6, 6) about the model's pivot, second moment about `motion`
+    covariance: Array  # (6, 6) about the model's pivot, second moment about `motion`, widened where its 95% limit holds less
     offset_mm: float
     speed: float
     speed_sd: float
@@ -82,7 +85,7 @@ def sample_posterior(
     )
     proposal = np.stack([_log_density(model, minima, roots, k, state) + np.log(share[k]) for k in range(len(share))])
     cost = evaluate(model, state).cost
-    log_weight = -cost - scipy.special.logsumexp(proposal, axis=0)
+    log_weight = -CAUTION * cost - scipy.special.logsumexp(proposal, axis=0)
     weight = np.exp(log_weight - log_weight.max())
     weight = np.minimum(weight, weight.mean() * np.sqrt(count))  # truncated: one lucky sample decides nothing
     weight = weight / weight.sum()
@@ -122,7 +125,7 @@ def _moments(
     speed = float(weight @ state.speed)
     return Posterior(
         motion=motion,
-        covariance=(weight[:, None] * left).T @ left,
+        covariance=covariance_holding(left, weight, (model.points - model.pivot)[::TOLD_AT]),
         offset_mm=float(weight @ state.offset),
         speed=speed,
         speed_sd=float(np.sqrt(weight @ (state.speed - speed) ** 2)),
@@ -130,6 +133,21 @@ def _moments(
         effective_samples=float(1 / np.sum(weight**2)),
         likeliest=state.take(likeliest[:FOLLOWED]),
     )
+
+
+def covariance_holding(vectors: Array, weight: Array, arms: Array) -> Array:
+    """(6, 6) second moment of weighted motions (S, 6), widened until its 95% limit at `arms` (P, 3) holds 95% of them.
+
+    A second, less likely minimum lies beyond the limit that a Gaussian of the same second moment has.
+    """
+    covariance = (weight[:, None] * vectors).T @ vectors
+    design = motion_jacobian(arms, np.zeros(3))
+    lengths = np.linalg.norm(np.einsum("pij,sj->psi", design, vectors), axis=2)
+    order = np.argsort(lengths, axis=1)
+    reached = np.cumsum(weight[order], axis=1) >= TOLD_SHARE
+    limit = np.take_along_axis(lengths, order, axis=1)[np.arange(len(arms)), np.argmax(reached, axis=1)]
+    told = length_statistics(design @ covariance @ np.swapaxes(design, -1, -2)).p95_mm
+    return np.asarray(covariance * max(float(limit.mean() / told.mean()), 1.0) ** 2, dtype=np.float64)
 
 
 def geometric_median(vectors: Array, weight: Array, arms: Array) -> Array:
