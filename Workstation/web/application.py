@@ -28,6 +28,7 @@ from Workstation.web.session_files import Places
 from Workstation.web.session_files_view import FilesDialog
 from Workstation.web.session_folder import SessionFolder, new_folder
 from Workstation.web.session_panel import SessionLogic
+from Workstation.web.session_resume_view import Resuming
 from Workstation.web.session_windows import Windows
 from Workstation.web.sharpness import Sharpness, resize_slice
 from Workstation.web.sounds import Cues, TiltTone, situation
@@ -75,6 +76,7 @@ class WorkstationApp(TrameApp):
         self._in_turn = itertools.cycle(self.panels)  # of panels that are not shown, one at a time is looked at
         self._use_folder()
         self.views, self.cues, self.tilt = ViewFollower(self.slicer, self.runner.start), Cues(), TiltTone()
+        self.resuming = Resuming(self.server.state)
         self.controls = ViewControls(self.server, self.layouts, self.views.fit)
         self.server.state.legend, self.server.state.cue, self.server.state.muted = None, {}, False
         self.server.state.tilt = self.tilt.next(None)
@@ -237,14 +239,16 @@ class WorkstationApp(TrameApp):
                 self._draw_slices()
             self._moves = moves
             with self.server.state as state:
+                drawn = not (self.painter.waits or self.views.waits)  # what the last look has asked for
                 self._refresh_views(state)
+                back = self.resuming.refresh(self.panels[SESSION].model, drawn and not self.views.waits, now_s)
                 self.controls.look()
                 self.sliders.refresh()
                 if state.step in ("devices", "ultrasound"):
                     state.live = drawings(self.logics[ULTRASOUND])
                 state.files = self.logics[SESSION].offered()
                 state.simulated = self._is_simulated()
-            for name in modules_of(self.server.state.step):
+            for name in self.panels if back else modules_of(self.server.state.step):
                 self.panels[name].refresh()
             if not moves or turn % (3 * REFRESH_EVERY) == 0:
                 self.panels[next(self._in_turn)].refresh()

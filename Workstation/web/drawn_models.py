@@ -43,6 +43,11 @@ class CoarseCopy:
         """The copy; None without one."""
         return self._node if self._node is not None and self._node.GetScene() is not None else None
 
+    @property
+    def waits(self) -> bool:
+        """Whether it is being made."""
+        return self._source is not None and self._mesh is None
+
     def refresh(self) -> bool:
         """Follow the role's model; True if another one is shown than before."""
         model = scene.find(self._role)

@@ -15,9 +15,10 @@ from Workstation.web.drawings_view import STYLE as DRAWINGS_STYLE
 from Workstation.web.drawings_view import draw_live
 from Workstation.web.keyboard import draw_help
 from Workstation.web.panel_view import PanelView
-from Workstation.web.procedure import HAND, ProcedureStep
+from Workstation.web.procedure import HAND, SESSION, ProcedureStep
 from Workstation.web.session_files_view import draw_files
 from Workstation.web.session_link import draw_link
+from Workstation.web.session_resume_view import draw_resuming
 from Workstation.web.sounds_view import draw_sounds
 from Workstation.web.toolbar import draw_toolbar
 from Workstation.web.view_frame import STYLE as FRAME_STYLE
@@ -81,6 +82,7 @@ class Page:
                     client.ServerTemplate(name=(name,))
             with v3.VMain(style="height: 100vh;"), html.Div(classes="views"):
                 layouts.initialize_layout_grid(self.layout)
+            draw_resuming(self.panels[SESSION].key)
             draw_link()
 
     def _draw_title(self, procedure: tuple[ProcedureStep, ...]) -> None:

@@ -51,6 +51,11 @@ class ViewFollower:
         self._look_at(step, asked_for)
         return legend
 
+    @property
+    def waits(self) -> bool:
+        """Whether a surface that is to be shown is still being made."""
+        return self._bone.waits or self._skin.waits
+
     def fit(self) -> None:
         """Frame all views anew."""
         self._framing.fit()

@@ -12,6 +12,7 @@ FIRST = "First:"
 DONE = "Done."
 NOW, SEE_BELOW = "Now: ", "see below"
 OPEN_FILE = "Open"
+RESUMING = "Bringing back the session …"
 DETAILS, SETTINGS, CANCEL = "Details", "Settings", "Cancel"
 
 # Title bar and keys
