@@ -1,3 +1,4 @@
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -243,3 +244,17 @@ def test_lone_clear_echo_is_taken_in_most_lines_however_quiet_they_are(snr_db):
     recording = record(rng, np.full(30, 6.0), Acquisition(50e6, 5e6), samples=1500, points=np.zeros(30, dtype=int))
     measured = measure_lines(replace(recording, lines=lines.astype(np.int16)), EchoSettings(speed_of_sound_m_s=SPEED))
     assert measured.accepted.mean() > 0.75
+
+
+def test_lines_are_measured_on_one_thread_and_leave_the_other_cores_alone():
+    rng = np.random.default_rng(15)
+    few = record(rng, np.full(10, 6.0), Acquisition(50e6, 5e6), samples=600, points=np.zeros(10, dtype=int))
+    index = np.arange(1500) % 10
+    recording = Recording(
+        few.lines[index], few.acquisition, few.probe_to_reference[index], ("OK",) * 1500, np.arange(1500) / 50, 0 * index
+    )
+    measure_lines(recording)  # threads of what ran before come to rest
+    own, all_threads = time.thread_time(), time.process_time()
+    measure_lines(recording)
+    own, all_threads = time.thread_time() - own, time.process_time() - all_threads
+    assert all_threads < 1.3 * own
