@@ -11,7 +11,7 @@ from CranioNavLib.slicer_files import LabelledPoints
 from vtkmodules.util.numpy_support import vtk_to_numpy
 
 from Workstation.web import color_scale, error_views, framing
-from Workstation.web.drawn_models import CoarseCopy
+from Workstation.web.drawn_models import CoarseCopy, hide
 from Workstation.web.point_styles import STYLES, PointStyles
 from Workstation.web.tool_models import ErrorRing, ToolModels
 
@@ -166,6 +166,16 @@ def test_a_copy_is_made_elsewhere_and_shown_when_it_is_ready_unless_there_is_a_n
     assert not copy.refresh()
     assert not model.GetDisplayNode().GetVisibility()
     np.testing.assert_allclose(copy.node.GetPolyData().GetBounds(), model.GetPolyData().GetBounds(), atol=3.0)
+
+
+def test_a_large_surface_is_hidden_before_the_first_picture_of_it(an_empty_scene):
+    from CranioNavLib.phantom import make_patient
+
+    model = scene_data.set_surface("Bone", make_patient(None, seed=1).bone)
+    assert model.GetDisplayNode().GetVisibility()
+    hide("Bone")
+    hide("Skin")  # there is none
+    assert not model.GetDisplayNode().GetVisibility()
 
 
 def test_the_expected_error_is_drawn_where_it_is_and_shrinks_with_points(an_empty_scene):

@@ -214,6 +214,7 @@ class WorkstationApp(TrameApp):
 
     def _lead(self) -> None:
         """Just before the views are painted: the newest poses, and the slices where the leading tool is now."""
+        self.views.hide_large()
         self._poll()
         place = self._followed()
         if place != self._place:

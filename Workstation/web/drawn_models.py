@@ -20,6 +20,13 @@ def new_model(name: str, color: tuple[float, float, float]) -> Any:
     return node
 
 
+def hide(role: str) -> None:
+    """Do not show the model of a role itself, if there is one."""
+    model = scene.find(role)
+    if model is not None and model.GetDisplayNode() is not None and model.GetDisplayNode().GetVisibility():
+        model.GetDisplayNode().SetVisibility(False)
+
+
 class CoarseCopy:
     """Stands in the views for the model of a role, which itself is hidden.
 
@@ -59,7 +66,7 @@ class CoarseCopy:
             return False
         if source is not self._source:
             self._source, self._mesh = source, None
-            model.GetDisplayNode().SetVisibility(False)
+            hide(self._role)
             self._make(source)
         if self._mesh is None or (self.node is not None and self.node.GetPolyData() is self._mesh):
             return False

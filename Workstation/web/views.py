@@ -6,7 +6,7 @@ from typing import Any
 
 from CranioNavLib import scene, slice_views
 
-from Workstation.web.drawn_models import CoarseCopy
+from Workstation.web.drawn_models import CoarseCopy, hide
 from Workstation.web.error_views import RESIDUALS, ErrorViews
 from Workstation.web.framing import Framing
 from Workstation.web.point_styles import PointStyles
@@ -55,6 +55,11 @@ class ViewFollower:
     def waits(self) -> bool:
         """Whether a surface that is to be shown is still being made."""
         return self._bone.waits or self._skin.waits
+
+    def hide_large(self) -> None:
+        """Hide the surfaces that copies stand in for, before one of them is drawn even once."""
+        for role in ("Bone", "Skin", "OuterTable"):  # the last one lies on Bone: drawing both shows nothing more
+            hide(role)
 
     def fit(self) -> None:
         """Frame all views anew."""
