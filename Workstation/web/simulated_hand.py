@@ -158,7 +158,7 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         self._does = ("touch", waiting[0], time.monotonic() + MOVE_S)
         return f"the stylus goes to {waiting[0]}"
 
-    def palpateAll(self) -> str:
+    def palpateAll(self) -> str | Task:
         """Palpate the planned points one after another, or glide over them."""
         session = self._session()
         points = scene_data.get_points("ProtocolPoints")
@@ -169,18 +169,24 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
             raise InputError("nothing is recorded yet; press Record first")
         session.put_away("Stylus")
         if self.sweeping():
-            self._glides_until_s = time.monotonic() + session.sweep_plan()
-            return "the hand glides over the skull, there and back"
+            return Task("Simulated hand: palpate", lambda progress: session.sweep_plan(), self._glide)
         self._visit = Visit(0, -1, 0.0)
         return f"the hand rests on each of {len(points)} points until it is taken"
+
+    def _glide(self, duration_s: float) -> str:
+        self._glides_until_s = time.monotonic() + duration_s
+        return "the hand glides over the skull to and fro until the recording is stopped"
 
     def poll(self) -> None:
         """While palpating: go where the protocol asks. A point that is not taken in time is left out."""
         visit, node = self._visit, scene.find("Protocol")
         session = running_simulation()
-        if self._glides_until_s and session is not None and (not self.sweeping() or time.monotonic() > self._glides_until_s):
-            session.put_away("Probe")
-            self._glides_until_s = 0.0
+        if self._glides_until_s and session is not None:
+            if not self.sweeping():
+                session.put_away("Probe")
+                self._glides_until_s = 0.0
+            elif time.monotonic() > self._glides_until_s:
+                self._glide(session.sweep_plan())
         if visit is None or session is None or node is None:
             return
         now, asked, count = time.monotonic(), int(node.GetParameter("current") or 0), len(scene_data.get_points("ProtocolPoints"))

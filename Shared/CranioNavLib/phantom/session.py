@@ -211,8 +211,12 @@ class SimulatedSession:
         order = _nearest_next(places)
         way = [*order, *order[-2::-1]]
         length_mm = float(np.linalg.norm(np.diff(places[way], axis=0), axis=1).sum())
+        steps = max(2, int(length_mm / SLIDE_STEP_MM))
         with self._lock:
-            poses = slide_over(self.patient, places[way], normals[way], max(2, int(length_mm / SLIDE_STEP_MM)), self._rng)
+            rng = np.random.default_rng(int(self._rng.integers(2**62)))
+        # steered as when the probe rests, since the page tells the tilt; outside the lock, for the devices go on
+        poses = slide_over(self.patient, places[way], normals[way], steps, rng, self.skill.tilt_sd_deg)
+        with self._lock:
             self._hold(PROBE, self.patient.ras_to_reference @ poses[0], 0.0)
             held, self.palpation_point = self._held[PROBE], -1
             approach, duration_s = held.path, length_mm / constants.SWEEP_MM_S
