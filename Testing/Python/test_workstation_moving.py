@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -216,6 +217,20 @@ def test_what_the_round_brings_into_the_scene_is_in_its_pictures():
 
     painted_of(ask, 0.05)
     assert order[:2] == ["lead", "a"]
+
+
+def test_quick_views_do_not_wait_for_slow_ones():
+    async def ask(views: Any, _: Any) -> None:
+        draw = views["b"].source.draw
+        views["b"].source.draw = lambda: time.sleep(0.03) or draw()
+        for _ in range(3):
+            for name in "abc":
+                views[name].schedule_render()
+            await asyncio.sleep(0.15)
+
+    painted = painted_of(ask)
+    assert painted[:3] == ["a", "b", "c"]  # nothing is known of them yet
+    assert painted[5:6] == painted[8:9] == ["b"]
 
 
 def test_a_defect_in_one_view_stops_neither_the_others_nor_itself():
