@@ -93,7 +93,7 @@ def test_landmarks_are_placed_moved_and_taken_back_in_the_views(tmp_path):
         user.page.keyboard.press("ArrowLeft")  # 1 mm to the patient's right
         user.page.keyboard.press("p")
         by_keys = wait_until_saved(user, folder, lambda found: "Nasion" in found)
-        np.testing.assert_allclose(by_keys["Nasion"], np.add(on_head["Nasion"], (1, 10, 0)), atol=0.1)  # it was chosen there
+        np.testing.assert_allclose(by_keys["Nasion"], np.add(on_bone["Nasion"], (1, 10, 0)), atol=0.1)  # there the slices went
         assert user.defects == []
 
 
