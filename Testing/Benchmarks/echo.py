@@ -3,8 +3,8 @@
     python -m Testing.Benchmarks.echo --worlds 300 --seed 7
 
 The recordings are drawn like those of the calibration, from each of its families (Testing/Studies/echo_lines.py,
-tissue_lines.py, bench_lines.py, and plain_lines.py, which no network is fitted to), with other seeds. Depths are judged with
-the true speed of sound given.
+tissue_lines.py, bench_lines.py, page_lines.py, and plain_lines.py, which no network is fitted to), with other seeds. Depths
+are judged with the true speed of sound given.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy.typing as npt
 from CranioNavLib.sequence_metafile import Acquisition, Recording
 from ModuleUltrasoundLib.measure import EchoSettings, measure_lines
 
-from Testing.Studies import bench_lines, plain_lines, tissue_lines
+from Testing.Studies import bench_lines, page_lines, plain_lines, tissue_lines
 from Testing.Studies.echo_lines import draw_world, simulate
 
 Array = npt.NDArray[np.float64]
@@ -31,6 +31,7 @@ SYMMETRIC = ("gauss", "ricker", "hann", "chirp", "symmetric")
 SIMULATORS: dict[str, Callable[..., Any]] = {
     "tissue_lines": tissue_lines.simulate,
     "bench_lines": bench_lines.simulate,
+    "page_lines": page_lines.simulate,
     "plain_lines": plain_lines.simulate,
 }
 FAMILIES = ("echo_lines", *SIMULATORS)
