@@ -73,6 +73,7 @@ class WorkstationApp(TrameApp):
             )
         self._place: tuple[Any, ...] = ()  # that the slices show
         self._moves, self._moved_s, self._sharpness = False, 0.0, Sharpness(self._sharpen)
+        self._polled_s = 0.0
         self._in_turn = itertools.cycle(self.panels)  # of panels that are not shown, one at a time is looked at
         self._use_folder()
         self.views, self.cues, self.tilt = ViewFollower(self.slicer, self.runner.start), Cues(), TiltTone()
@@ -157,7 +158,8 @@ class WorkstationApp(TrameApp):
 
         for turn in itertools.count():
             await asyncio.sleep(POLL_S)
-            self._poll()
+            if time.monotonic() > self._polled_s + POLL_S:  # or a round of pictures has just done it
+                self._poll()
             if self.logics[TRACKING].stream is not None:
                 self.logics[TRACKING].stream.on_news = tell
             for part in (self._move, self._turn, self._keep):
@@ -181,6 +183,7 @@ class WorkstationApp(TrameApp):
 
     def _poll(self) -> None:
         """Take over what the devices have to say. Not drawn while a tool's place in the CT is not known."""
+        self._polled_s = time.monotonic()
         self.painter.muted = not registered()
         for name in (TRACKING, ULTRASOUND, HAND):
             moving = self.painter.while_moving() if name == TRACKING else contextlib.nullcontext()

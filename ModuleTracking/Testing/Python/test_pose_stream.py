@@ -67,6 +67,18 @@ def test_waiting_ends_with_the_news_and_begins_anew_when_they_are_taken(a_tracke
     assert not a_stream.wait(0)
 
 
+def test_who_listens_is_told_of_every_frame_when_it_can_be_taken(a_tracker, a_stream):
+    wait_until(lambda: a_stream.wait(0))  # it is connected
+    a_stream.poll()
+    told: list = []
+    a_stream.on_news = lambda: told.append(a_stream.wait(0))
+    for count in (1, 2, 3):
+        a_tracker.put([ok("Probe", a_pose(count), 1000 + count / 60)])
+        wait_until(lambda wanted=count: len(told) == wanted)
+        assert told[-1]
+        assert len(a_stream.poll()) == 1
+
+
 def test_a_full_queue_drops_the_oldest_and_counts(a_tracker, a_clock):
     with PoseStream(a_tracker, queue_frames=10, clock=a_clock) as stream:
         for k in range(50):
