@@ -259,6 +259,28 @@ def test_nothing_is_painted_for_what_is_not_to_be_seen_or_cannot_be_shown():
     assert painted_of(ask, draws=lambda area: area != "b") == ["b"] * MOST_ON_THEIR_WAY + ["c"]
 
 
+@pytest.mark.parametrize(("place", "deeds"), [((), ["ring gone"]), (("a tip",), ["followed"])])
+def test_what_follows_a_tool_does_so_in_navigation_alone(place, deeds):
+    from Workstation.web.application import WorkstationApp
+
+    done: list[str] = []
+    views = SimpleNamespace(hide_large=bool, ring=lambda tip, error: done.append("ring gone" if tip is error is None else "ring"))
+    app = SimpleNamespace(
+        views=views,
+        painter=Painter(Pictures()),
+        _place=("another tip",),
+        _moved_s=0.0,
+        _poll=bool,
+        _followed=lambda: place,
+        _navigate=lambda: done.append("followed"),
+        _draw_moving=bool,
+    )
+    WorkstationApp._lead(app)
+    assert done == deeds
+    WorkstationApp._lead(app)
+    assert done == deeds  # nothing has moved since
+
+
 def test_only_what_stands_still_makes_a_kept_picture_old():
     painter, source = Painter(Pictures()), Source("a", [])
     view = PacedRendering("a", source, painter, 90)

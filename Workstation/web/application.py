@@ -223,7 +223,10 @@ class WorkstationApp(TrameApp):
         if place != self._place:
             self._place, self._moved_s = place, time.monotonic()
             with self.painter.while_moving():
-                self._navigate()
+                if place:
+                    self._navigate()
+                else:
+                    self.views.ring(None, None)  # the step is another one; a ring that stays behind would be about nothing
             self._draw_moving()
 
     def _followed(self) -> tuple[Any, ...]:
