@@ -4,7 +4,8 @@
 
 Writes DIR/registration.csv and DIR/registration.png. The cases are simulated: 18 points drawn over the regions of the
 palpation protocol on the surface itself, a common offset, white noise, four landmarks. Points carry errors, the surface
-does not, so the figures compare methods; they are no accuracy of the system. Without --surface the sample head's outer
+does not, so the figures compare methods; they are no accuracy of the system. The picture shows the processor's time, which
+other programs on the machine do not change. Without --surface the sample head's outer
 table is used.
 """
 
@@ -195,14 +196,15 @@ def run(surface: Surface, trials: int, landmark_sd_mm: float, with_trimesh: bool
     """One row a method."""
     head, rows = Head(surface), []
     for name, build in contestants(surface, with_trimesh).items():
-        first_ms = np.inf
+        first_ms = first_cpu_ms = np.inf
         for _ in range(2):  # the first of them imports the library, too
             indexed = fresh(surface)
             problem = head.trial(0, landmark_sd_mm, indexed).problem
-            started = time.perf_counter()
+            started, cpu_started = time.perf_counter(), time.process_time()
             solve = build()
             solve(problem)
             first_ms = min(first_ms, 1e3 * (time.perf_counter() - started))
+            first_cpu_ms = min(first_cpu_ms, 1e3 * (time.process_time() - cpu_started))
         errors, times, cpu_times, bounds = [], [], [], []
         for seed in range(trials):
             trial = head.trial(seed, landmark_sd_mm, indexed)
@@ -225,12 +227,14 @@ def run(surface: Surface, trials: int, landmark_sd_mm: float, with_trimesh: bool
                 "median_ms": float(np.median(times)),
                 "median_cpu_ms": float(np.median(cpu_times)),
                 "first_call_with_index_ms": first_ms,
+                "first_call_with_index_cpu_ms": first_cpu_ms,
             }
         )
         print(
             f"{name:36s} TRE {rows[-1]['tre_mean_mm']:6.2f} / {rows[-1]['tre_sd_mm']:5.2f} / {rows[-1]['tre_max_mm']:6.2f} mm, "
             f"above 3 mm {rows[-1]['above_3mm']}/{trials}, bound {rows[-1]['cramer_rao_mm']:.2f} mm, "
-            f"{rows[-1]['median_ms']:7.1f} ms ({rows[-1]['median_cpu_ms']:.1f} of the processor), with index {first_ms:7.1f} ms",
+            f"{rows[-1]['median_ms']:7.1f} ms ({rows[-1]['median_cpu_ms']:.1f} of the processor), "
+            f"with index {first_ms:7.1f} ms ({first_cpu_ms:.1f})",
             flush=True,
         )
     return rows
@@ -258,9 +262,10 @@ def plot(rows: list[dict[str, float | str]], triangles: int, path: Path) -> None
         share = 100 * float(row["above_3mm"]) / float(row["trials"])
         failed.barh(place, share, height=0.24, color=colour)
         failed.text(share + 2, place, f"{share:.0f}", va="center", fontsize=8)
-        speed.plot([float(row["median_ms"]), float(row["first_call_with_index_ms"])], [place, place], color=colour, alpha=0.4)
-        speed.plot(float(row["median_ms"]), place, "o", color=colour, markersize=6)
-        speed.plot(float(row["first_call_with_index_ms"]), place, "o", color=colour, markersize=6, markerfacecolor="white")
+        times = [float(row["median_cpu_ms"]), float(row["first_call_with_index_cpu_ms"])]
+        speed.plot(times, [place, place], color=colour, alpha=0.4)
+        speed.plot(times[0], place, "o", color=colour, markersize=6)
+        speed.plot(times[1], place, "o", color=colour, markersize=6, markerfacecolor="white")
     for level, sd in enumerate(levels):
         tre.plot([], [], "o", color=f"C{level}", label=f"landmarks {sd:g} mm (SD per axis)")
     bound = float(rows[0]["cramer_rao_mm"])
@@ -271,7 +276,10 @@ def plot(rows: list[dict[str, float | str]], triangles: int, path: Path) -> None
     tre.xaxis.set_major_formatter(FormatStrFormatter("%g"))
     tre.xaxis.set_minor_locator(NullLocator())
     failed.set(xlim=(0, 122), xticks=(0, 50, 100), xlabel="TRE above 3 mm (% of cases)")
-    speed.set(xscale="log", xlabel="one registration (ms): filled with the index built,\nhollow the first call, index included")
+    speed.set(
+        xscale="log",
+        xlabel="processor time of one registration (ms): filled with\nthe index built, hollow the first call, index included",
+    )
     tre.invert_yaxis()
     for axes in (tre, speed):
         axes.grid(axis="x", color="0.9")
