@@ -267,6 +267,18 @@ def test_the_skull_is_not_coloured_by_another_registrations_error_while_its_own_
     assert len(waiting) == 2
 
 
+def test_points_are_counted_while_they_are_palpated_and_not_during_a_sweep(an_empty_scene):
+    from types import SimpleNamespace
+
+    from Workstation.web.drawings import progress
+
+    scene_data.set_points("ProtocolPoints", LabelledPoints(("a", "b", "c"), np.eye(3)))
+    logic = SimpleNamespace(sweep=None, recorded=lambda: "12 lines", taken=lambda: ["a"], currentIndex=lambda: 2)
+    assert [one["state"] for one in progress(logic)] == ["taken", "open", "now"]
+    logic.sweep = object()
+    assert progress(logic) == []
+
+
 def test_the_ring_has_the_size_of_the_error_and_goes_without_one(an_empty_scene):
     ring = ErrorRing()
     ring.show(np.array([10.0, -20, 30]), 2.5)

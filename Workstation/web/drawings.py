@@ -80,9 +80,9 @@ def bulls_eye(logic: Any) -> dict[str, Any] | None:
 
 
 def progress(logic: Any) -> list[dict[str, Any]]:
-    """One entry a planned point: taken, asked for, or open."""
+    """One entry a planned point: taken, asked for, or open; none while a sweep is recorded, which asks for no point."""
     node = scene.find("ProtocolPoints")
-    if node is None:
+    if node is None or logic.sweep is not None:
         return []
     if logic.recorded() is None and scene.find("SurfacePoints") is not None:
         return []  # palpated and measured
