@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Optional, Union
 
+import numpy as np
 from CranioNavLib import scene_data
 from CranioNavLib.files import output_folder
 from CranioNavLib.module_logic import done_or
@@ -22,6 +25,7 @@ if TYPE_CHECKING:
     OnSurface = tuple[RegistrationProblem, RegistrationResult, SurfaceRegistration]
 
 MARKERS, TOUCHED = ("TargetsCT", "TargetsPatient"), ("PlausibilityPoints", "Bone")  # what there may be to verify with
+SAME_ENTRY = 1e-4  # of two transforms that are one registration, rounded by files: 0.01 mm on a head
 
 
 class VerifyingSteps(RegisteringSteps):
@@ -34,9 +38,11 @@ class VerifyingSteps(RegisteringSteps):
 
         given, labels = self._toVerify()
 
+        again = self._again()
+
         def check(progress: Progress) -> Checks:
             progress("comparing with what the registration has not used", 0.1)
-            return verify(given)
+            return verify(given if again is None else replace(given, surface=again()))
 
         def take(checks: Checks) -> Union[str, Reading]:
             errors, distances = checks.errors, checks.distances
@@ -91,12 +97,31 @@ class VerifyingSteps(RegisteringSteps):
             return None
         return self.registered.problem, self.registered.result, self.registered.method
 
+    def _isReadBack(self) -> bool:
+        """Whether a surface registration stands that was not made here, but read with all that it was made of."""
+        return self.registered is None and results.status() in ("accepted", "warning") and not self.registerSurfaceBlocked()
+
+    def _again(self) -> Optional[Callable[[], Optional[OnSurface]]]:
+        """What repeats a registration that was read back, off the main thread; its outcome is None if it is another one."""
+        if not self._isReadBack():
+            return None
+        _, problem, _ = self._problem()
+        method = self.createPlugin("registration", self.parameters().read().method)
+        in_force = scene_data.get_transform("ReferenceToRas")
+
+        def register() -> Optional[OnSurface]:
+            result = method.register(problem)
+            same = np.allclose(result.reference_to_ras, in_force, rtol=0, atol=SAME_ENTRY)
+            return (problem, result, method) if same else None
+
+        return register
+
     def verifyBlocked(self) -> str:
         """Why nothing can be verified now."""
         if not results.status():
             return "register first"
         missing = lacking(*MARKERS), lacking(*TOUCHED)
-        return "" if "" in missing or self._verifiable() else missing[0]
+        return "" if "" in missing or self._verifiable() or self._isReadBack() else missing[0]
 
     def measuredTre(self) -> Optional[Reading]:
         """Measured TRE."""

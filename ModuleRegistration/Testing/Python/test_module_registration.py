@@ -262,6 +262,26 @@ def test_landmarks_are_planned_without_a_mouse_and_each_step_is_taken_back(a_bal
         logic.placeHere()
 
 
+def test_a_registration_that_was_read_back_can_be_verified_by_its_held_out_points(a_patient):
+    a_patient.registerLandmarks()
+    a_patient.registerSurface().run()
+    results.set_verdict("accepted")
+    for role in ("TargetsPatient", "PlausibilityPoints"):
+        scene.release(role)
+    a_patient.registered = None  # as in another process
+    assert a_patient.verifyBlocked() == ""
+    a_patient.verify().run()
+    assert names.HELD_OUT in results.rows()
+    a_patient.parameters().change(method="random-icp")
+    results.write_rows({key: value for key, value in results.rows().items() if key != names.HELD_OUT})
+    scene_data.set_transform(
+        "ReferenceToRas", scene_data.get_transform("ReferenceToRas") @ rigid_from_vector([0, 0, 0.1], [1, 0, 0])
+    )
+    results.set_verdict("accepted")
+    a_patient.verify().run()
+    assert names.HELD_OUT not in results.rows(), "not those of another registration"
+
+
 def test_a_landmark_in_the_head_needs_attention_and_is_moved_to_the_bone(a_patient, a_skull):
     on_bone = a_skull.closest(LANDMARKS).points_mm
     inside = np.where(np.arange(4)[:, None] == 1, 0.5, 1.0) * on_bone
