@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from CranioNavLib import host, scene, scene_data, slice_views
 from CranioNavLib.slicer_files import LabelledPoints
+from CranioNavLib.surface import Surface
 from vtkmodules.util.numpy_support import vtk_to_numpy
 
 from Workstation.web import color_scale, error_views, framing
@@ -147,10 +148,19 @@ def a_bone(an_empty_scene):
     return copy
 
 
-def test_a_copy_is_made_elsewhere_and_shown_when_it_is_ready_unless_there_is_a_newer_bone(an_empty_scene):
-    from CranioNavLib.phantom import make_patient
+def a_ball(radius_mm):
+    from vtkmodules.vtkFiltersSources import vtkSphereSource
 
-    bones, waiting = [make_patient(None, seed=seed).bone for seed in (1, 2)], []
+    source = vtkSphereSource()
+    source.SetRadius(radius_mm)
+    source.SetThetaResolution(40)
+    source.SetPhiResolution(40)
+    source.Update()
+    return Surface.from_polydata(source.GetOutput())
+
+
+def test_a_copy_is_made_elsewhere_and_shown_when_it_is_ready_unless_there_is_a_newer_bone(an_empty_scene):
+    bones, waiting = [a_ball(radius) for radius in (60.0, 80.0)], []
     copy = CoarseCopy("Bone", lambda compute, finished: waiting.append((compute, finished)))
     model = scene_data.set_surface("Bone", bones[0])
     assert not copy.refresh()  # it is being made
@@ -169,9 +179,7 @@ def test_a_copy_is_made_elsewhere_and_shown_when_it_is_ready_unless_there_is_a_n
 
 
 def test_a_large_surface_is_hidden_before_the_first_picture_of_it(an_empty_scene):
-    from CranioNavLib.phantom import make_patient
-
-    model = scene_data.set_surface("Bone", make_patient(None, seed=1).bone)
+    model = scene_data.set_surface("Bone", a_ball(60.0))
     assert model.GetDisplayNode().GetVisibility()
     hide("Bone")
     hide("Skin")  # there is none

@@ -47,6 +47,7 @@ class MovingPicture:
         self._window.SetOffScreenRendering(1)
         self._window.SetMultiSamples(0)
         self._window.SetAlphaBitPlanes(1)
+        self._window.SwapBuffersOff()  # there is no screen, and what was drawn is read from where it was drawn
         self._renderer.SetBackgroundAlpha(0.0)
         self._window.AddRenderer(self._renderer)
         self._actors: dict[str, Any] = {}

@@ -59,9 +59,11 @@ class SlicePicture:
         below = self._cut.draw(self._view)
         image = self._view._render_manager.image_actor
         image.SetVisibility(False)
+        window.SwapBuffersOff()  # there is no screen, and what was drawn is read from where it was drawn
         try:
             window.Render()
         finally:
+            window.SwapBuffersOn()
             image.SetVisibility(True)
         height, width = below.shape
         window.GetRGBACharPixelData(0, 0, width - 1, height - 1, 0, self._pixels)
