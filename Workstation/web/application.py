@@ -17,7 +17,7 @@ from CranioNavLib.panel_model import PanelModel
 from trame.app import TrameApp
 from trame_slicer.app.logic import get_view_trame_id
 
-from Workstation.web.background import BackgroundRunner, load_soon_needed
+from Workstation.web.background import BackgroundRunner, load_soon_needed, make_later_needed
 from Workstation.web.built_once import built_once
 from Workstation.web.drawings import drawings
 from Workstation.web.page import Page
@@ -40,6 +40,7 @@ from Workstation.web.views import ViewFollower
 POLL_S = 0.03  # views that follow a tool look for a newer pose just before they are painted
 REFRESH_EVERY = 6  # polls between two looks at the read-outs
 AHEAD_S = 1.0  # after the first window has come, whose first pictures go first
+LATER_S = 10.0  # after that
 STANDS_S = 0.6  # without a new pose: nothing moves
 SAVE_EVERY = 33  # polls between two looks at what is to be saved
 PICTURE_QUALITY = 90  # JPEG; one quality for moving and still pictures, so that none is sent twice
@@ -174,6 +175,8 @@ class WorkstationApp(TrameApp):
             await asyncio.sleep(POLL_S)
         await asyncio.sleep(AHEAD_S)
         self.runner.start(load_soon_needed, _raise_if_failed)
+        await asyncio.sleep(LATER_S)
+        self.runner.start(make_later_needed, _raise_if_failed)
 
     def _draw_again(self, area: str) -> None:
         """Send the picture of a view, or of all, to a window that has none yet."""

@@ -17,10 +17,13 @@ def load_soon_needed() -> None:
     for name in SOON_NEEDED:
         importlib.import_module(name)
 
+
+def make_later_needed() -> None:
+    """Make the tables of the expected error, which a registration needs at once. In a worker, when the page is up."""
     import numpy as np
     from ModuleRegistrationLib.registration.error_theory import length_statistics
 
-    length_statistics(np.eye(3)[None])  # its tables are made on first use
+    length_statistics(np.eye(3)[None])  # they are made on first use
 
 
 class BackgroundRunner:
