@@ -11,7 +11,6 @@ import numpy.typing as npt
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array, check_points
 from scipy import special
-from scipy.interpolate import RectBivariateSpline
 
 from ModuleRegistrationLib.registration.landmarks import motion_jacobian
 from ModuleRegistrationLib.registration.problem import RegistrationResult
@@ -120,6 +119,8 @@ GRID = 21  # ratios 0, 0.05 ... 1 of the SDs: the tables are smooth, a cubic spl
 @lru_cache(maxsize=1)
 def _length_tables() -> tuple[Any, Any]:
     """Splines of the mean length and its 95% quantile over (middle SD / largest, smallest SD / largest)."""
+    from scipy.interpolate import RectBivariateSpline  # slow to load, and this module is loaded at the start
+
     ratios = np.linspace(0, 1, GRID)
     middle, small = (grid.ravel() for grid in np.meshgrid(ratios, ratios, indexing="ij"))
     low: Array = np.full(GRID * GRID, 1.5)
