@@ -8,9 +8,9 @@ from typing import Any, Optional
 
 import numpy as np
 import numpy.typing as npt
+import scipy  # by its own name: its parts load when they are first used, after the start
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array, check_points
-from scipy import special
 
 from ModuleRegistrationLib.registration.landmarks import motion_jacobian
 from ModuleRegistrationLib.registration.problem import RegistrationResult
@@ -98,7 +98,7 @@ def length_statistics(covariances_mm2: npt.ArrayLike, degrees_of_freedom: Option
     total = np.asarray(variances.sum(axis=-1), dtype=np.float64)
     if degrees_of_freedom is not None:
         active = total**2 / np.maximum(np.sum(variances**2, axis=-1), 1e-300)  # 1 for a line, 3 for a sphere
-        widening = np.sqrt(active * special.fdtri(active, degrees_of_freedom, 0.95) / special.chdtri(active, 0.05))
+        widening = np.sqrt(active * scipy.special.fdtri(active, degrees_of_freedom, 0.95) / scipy.special.chdtri(active, 0.05))
         p95 = np.asarray(p95 * widening, dtype=np.float64)
     return PredictedTre(mean, p95, np.sqrt(total))
 
