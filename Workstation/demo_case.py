@@ -35,7 +35,7 @@ def make_case(volume: Optional[Volume], seed: int, folder: Path, mode: str = "II
     from CranioNavLib.phantom.case_writer import write_case
     from ModuleRegistrationLib.anatomy.segmentation import segment_bone
     from ModuleRegistrationLib.verification.simulated_patient import simulated_patient
-    from ModuleUltrasoundLib.protocol import plan_protocol
+    from ModuleUltrasoundLib.palpation.protocol import plan_protocol
 
     patient = simulated_patient(volume, seed)
     bone = segment_bone(patient.planning_ct)

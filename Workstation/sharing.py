@@ -10,7 +10,7 @@ from CranioNavLib.errors import InputError
 from ModuleTrackingLib.pose_stream import PoseStream
 from ModuleTrackingLib.sharing import Sharing
 from ModuleTrackingLib.tracker import Tracker
-from ModuleUltrasoundLib.device import AModeDevice
+from ModuleUltrasoundLib.devices.device import AModeDevice
 
 from Workstation.tracking import TURN_S, connect, interruption, live_table, open_device, read_device
 

@@ -19,7 +19,7 @@ from ModuleTrackingLib.pose_csv import PoseCsvWriter
 from ModuleTrackingLib.pose_stream import PoseStream
 from ModuleTrackingLib.recorder import SessionRecorder
 from ModuleTrackingLib.tracker import TRACKERS, ToolPose, Tracker
-from ModuleUltrasoundLib.device import AMODE_DEVICES, AModeDevice, DeviceError
+from ModuleUltrasoundLib.devices.device import AMODE_DEVICES, AModeDevice, DeviceError
 
 TURN_S = 0.01  # of the main loop: well under a frame at 60 Hz
 REDRAW_HZ = 10

@@ -17,8 +17,8 @@ from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Recording, read_recording
 from CranioNavLib.slicer_files import LabelledPoints
 from CranioNavLib.volume import Volume
-from ModuleUltrasoundLib.measure import LineMeasurements, bone_points, measure_lines
-from ModuleUltrasoundLib.speed_of_sound import SpeedEstimate, estimate_if_pressed
+from ModuleUltrasoundLib.measurement.measure import LineMeasurements, bone_points, measure_lines
+from ModuleUltrasoundLib.measurement.speed_of_sound import SpeedEstimate, estimate_if_pressed
 
 from ModuleRegistrationLib.anatomy.ct_reader import read_ct
 from ModuleRegistrationLib.anatomy.segmentation import BoneSurfaces, segment_bone

@@ -39,7 +39,7 @@ class RegistrationSelfTest(ScenarioOnScene):
         """What planning and a stylus would write: landmarks and markers in both frames, palpated bone points."""
         import numpy as np
         from CranioNavLib.slicer_files import LabelledPoints
-        from ModuleUltrasoundLib.protocol import plan_protocol
+        from ModuleUltrasoundLib.palpation.protocol import plan_protocol
 
         rng = np.random.default_rng(1)
         planned = patient.landmarks_ras_mm + rng.normal(0, 0.5, patient.landmarks_ras_mm.shape)

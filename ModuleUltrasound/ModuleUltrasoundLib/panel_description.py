@@ -9,8 +9,8 @@ from typing import Annotated, Optional
 from CranioNavLib.panel import Action, FileField, NodeField, Panel, ParameterField, PluginField, ReadOut, Step
 from CranioNavLib.parameters import Limits, Parameters
 
-from ModuleUltrasoundLib.device import AMODE_DEVICES
-from ModuleUltrasoundLib.measure import EchoSettings
+from ModuleUltrasoundLib.devices.device import AMODE_DEVICES
+from ModuleUltrasoundLib.measurement.measure import EchoSettings
 
 RECORDINGS = ("Recording (*.igs.mha *.igs.mhd *.mha)",)
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from CranioNavLib.sequence_metafile import Acquisition, Recording
-from ModuleUltrasoundLib.measure import EchoSettings, measure_lines
+from ModuleUltrasoundLib.measurement.measure import EchoSettings, measure_lines
 
 from Testing.Studies import bench_lines, page_lines, plain_lines, tissue_lines
 from Testing.Studies.echo_lines import draw_world, simulate

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.bone_points import BonePoints
 from CranioNavLib.rigid import Array
-from ModuleUltrasoundLib.measure import EchoSettings
+from ModuleUltrasoundLib.measurement.measure import EchoSettings
 from scipy.spatial.transform import Rotation
 
 SLOWEST_M_S, FASTEST_M_S = 1450.0, 1630.0  # of soft tissue (Heger et al., IEEE TMI 24(2), 2005)

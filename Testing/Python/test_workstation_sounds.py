@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from ModuleUltrasoundLib.guidance import cue
+from ModuleUltrasoundLib.palpation.guidance import cue
 
 from Workstation.web.sounds import Cues, Situation, TiltTone
 from Workstation.web.sounds_view import PLAY

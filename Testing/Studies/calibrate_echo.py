@@ -1,4 +1,4 @@
-"""Calibrate the bone likelihood on simulated lines of many kinds, and write ModuleUltrasoundLib/echo_weights.json.
+"""Calibrate the bone likelihood on simulated lines of many kinds, and write ModuleUltrasoundLib/echo/weights.json.
 
     python -m Testing.Studies.calibrate_echo --worlds 4400 --seed 30 [--cache DIR]
 
@@ -22,11 +22,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from CranioNavLib.recording import Recording
-from ModuleUltrasoundLib.echo_likelihood import shared_features
-from ModuleUltrasoundLib.echo_network import WEIGHTS, Likelihood, Network, probabilities, write_likelihood
-from ModuleUltrasoundLib.echo_search import Found, search_lines
-from ModuleUltrasoundLib.measure import EchoSettings, measure_lines, several_spots, stays
-from ModuleUltrasoundLib.quality import TOLERANCE_MM
+from ModuleUltrasoundLib.echo.likelihood import shared_features
+from ModuleUltrasoundLib.echo.network import WEIGHTS, Likelihood, Network, probabilities, write_likelihood
+from ModuleUltrasoundLib.echo.search import Found, search_lines
+from ModuleUltrasoundLib.measurement.measure import EchoSettings, measure_lines, several_spots, stays
+from ModuleUltrasoundLib.measurement.quality import TOLERANCE_MM
 
 from Testing.Studies import bench_lines, echo_lines, page_lines, plain_lines, tissue_lines
 from Testing.Studies.fit_network import Lines, fit, joined

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from ModuleUltrasoundLib.echo_network import Network
+from ModuleUltrasoundLib.echo.network import Network
 
 Floats = npt.NDArray[np.float32]
 

@@ -2,7 +2,7 @@
 
     python Testing/Studies/guided_alignment.py [--trials N] [--seed N]
 
-The guided hand follows the bull's-eye that `ModuleUltrasoundLib.guidance.guide` draws from a probe's pose on a bone
+The guided hand follows the bull's-eye that `ModuleUltrasoundLib.palpation.guidance.guide` draws from a probe's pose on a bone
 model whose registration is off by a rotation; the unguided one has the height of the echo alone. All users, heads
 and errors are simulated; the figures say what guidance can do for such a hand, not what surgeons will reach.
 """
@@ -22,9 +22,9 @@ for folder in ("Shared", "ModuleTracking", "ModuleUltrasound", "ModuleRegistrati
 
 from CranioNavLib.rigid import Array, rigid  # noqa: E402
 from CranioNavLib.surface import Surface  # noqa: E402
-from ModuleUltrasoundLib.guidance import guide, screen_axes  # noqa: E402
-from ModuleUltrasoundLib.hand_model import GuidedUser, Hand, HandParameters, UnguidedUser, echo_db  # noqa: E402
-from ModuleUltrasoundLib.protocol import ProtocolPoints, plan_protocol  # noqa: E402
+from ModuleUltrasoundLib.palpation.guidance import guide, screen_axes  # noqa: E402
+from ModuleUltrasoundLib.palpation.hand_model import GuidedUser, Hand, HandParameters, UnguidedUser, echo_db  # noqa: E402
+from ModuleUltrasoundLib.palpation.protocol import ProtocolPoints, plan_protocol  # noqa: E402
 
 STEP_S = 0.02
 DISPLAY_EVERY = 2  # steps: 25 pictures a second

@@ -21,11 +21,11 @@ def echo(
     from dataclasses import asdict
 
     from CranioNavLib.sequence_metafile import read_recording
-    from ModuleUltrasoundLib.echo_search import check_length
-    from ModuleUltrasoundLib.forerun_check import forerun_remark
-    from ModuleUltrasoundLib.measure import EchoSettings, measure_lines
-    from ModuleUltrasoundLib.measure_table import write_depths_csv
-    from ModuleUltrasoundLib.speed_of_sound import estimate_if_pressed
+    from ModuleUltrasoundLib.echo.search import check_length
+    from ModuleUltrasoundLib.measurement.forerun_check import forerun_remark
+    from ModuleUltrasoundLib.measurement.measure import EchoSettings, measure_lines
+    from ModuleUltrasoundLib.measurement.speed_of_sound import estimate_if_pressed
+    from ModuleUltrasoundLib.measurement.table import write_depths_csv
 
     from Workstation.terminal import print_json, progress_bar
 

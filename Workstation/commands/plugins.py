@@ -21,7 +21,7 @@ def plugins(
     from ModuleRegistrationLib.anatomy.segmentation import SEGMENTATIONS
     from ModuleRegistrationLib.registration.problem import METHODS
     from ModuleTrackingLib.tracker import TRACKERS
-    from ModuleUltrasoundLib.device import AMODE_DEVICES
+    from ModuleUltrasoundLib.devices.device import AMODE_DEVICES
 
     from Workstation.terminal import print_json, print_table
 

@@ -16,7 +16,7 @@ BULLS_EYE_DEG = 15.0  # at the rim
 
 def a_line(logic: Any) -> dict[str, Any] | None:
     """The last RF line as an SVG path with skin, bone and the gate between least and greatest depth; None without one."""
-    from ModuleUltrasoundLib.quality import reason_in_words
+    from ModuleUltrasoundLib.measurement.quality import reason_in_words
 
     live = logic.live()
     if live is None:

@@ -17,7 +17,7 @@ from CranioNavLib.module_logic import ParametersInScene
 from CranioNavLib.panel import Action, Level, Panel, Progress, Reading, ReadOut, Step, StepState, StepStatus, Task, words_of
 from CranioNavLib.parameters import Parameters
 from CranioNavLib.scripted_module import ScriptedLoadableModuleLogic
-from ModuleUltrasoundLib.measure import EchoSettings
+from ModuleUltrasoundLib.measurement.measure import EchoSettings
 
 from Workstation.web.session_folder import SessionFolder, last_session
 

@@ -239,7 +239,7 @@ def _resampled_slice(
 def lines_with_echo(result: CaseResult, most: int = 18) -> bytes | None:
     """The best A-line of each palpation point (or an even choice of a sweep) with skin and bone marked."""
     from matplotlib.figure import Figure
-    from ModuleUltrasoundLib.signal_chain import complex_envelopes, design_band
+    from ModuleUltrasoundLib.echo.signal_chain import complex_envelopes, design_band
 
     if result.ultrasound is None:
         return None

@@ -203,7 +203,7 @@ def _problem(
     bone: BoneSurfaces, landmarks: LandmarkRegistration, data: SessionData, landmark_sd_mm: Optional[float]
 ) -> RegistrationProblem:
     if data.recording is not None:
-        from ModuleUltrasoundLib.measure import bone_points, measure_lines
+        from ModuleUltrasoundLib.measurement.measure import bone_points, measure_lines
 
         points = bone_points(data.recording, measure_lines(data.recording))
     else:
@@ -229,7 +229,7 @@ _PLANS: dict[str, _Plan] = {}
 
 def _plan_for(volume: Optional[Volume]) -> _Plan:
     """Segmentation and palpation plan of the planning CT: the same for all patients of one head."""
-    from ModuleUltrasoundLib.protocol import plan_protocol
+    from ModuleUltrasoundLib.palpation.protocol import plan_protocol
 
     patient = simulated_patient(volume, 0)
     key = patient.bone.content_hash

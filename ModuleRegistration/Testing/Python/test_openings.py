@@ -15,7 +15,7 @@ from ModuleRegistrationLib.plugins.threshold import ThresholdSegmentation
 from ModuleRegistrationLib.registration.landmarks import register_landmarks
 from ModuleRegistrationLib.registration.problem import METHODS, RegistrationProblem
 from ModuleRegistrationLib.registration.verdict import judge
-from ModuleUltrasoundLib.protocol import ProtocolPoints, plan_protocol
+from ModuleUltrasoundLib.palpation.protocol import ProtocolPoints, plan_protocol
 
 TRUTH = rigid_from_vector([0.3, -0.2, 0.4], [20, -30, 40])  # ReferenceToRas
 BURR_HOLE, BURR_RADIUS_MM = "Frontal convexity 1", 7.0

@@ -1,4 +1,4 @@
-"""A stand-in for a pulser/receiver with the framed serial protocol (see `ModuleUltrasoundLib.framed`)."""
+"""A stand-in for a pulser/receiver with the framed serial protocol (see `ModuleUltrasoundLib.devices.framed`)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ModuleUltrasoundLib.devices.framed import KIND_LINE, KIND_TEXT, Frame, decode_command, encode_frame, parse_pairs
 from ModuleUltrasoundLib.emulators.faults import Chunk, Faults
 from ModuleUltrasoundLib.emulators.line_source import REFERENCE_GAIN_DB, LineSource
-from ModuleUltrasoundLib.framed import KIND_LINE, KIND_TEXT, Frame, decode_command, encode_frame, parse_pairs
 
 LONGEST_COMMAND = 500
 

@@ -69,7 +69,7 @@ class PatientLines:
     def __init__(self, seed: int = 0) -> None:
         from CranioNavLib.phantom import make_patient
 
-        from ModuleUltrasoundLib.protocol import plan_protocol
+        from ModuleUltrasoundLib.palpation.protocol import plan_protocol
 
         self._patient = make_patient(None, seed)
         self._rng = np.random.default_rng(seed)

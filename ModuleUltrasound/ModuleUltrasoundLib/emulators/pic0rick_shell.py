@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ModuleUltrasoundLib.emulators.faults import SPLIT_S, Chunk, Faults
-from ModuleUltrasoundLib.emulators.line_source import LineSource, RawCodes
-from ModuleUltrasoundLib.pic0rick_shell import (
+from ModuleUltrasoundLib.devices.pic0rick_shell import (
     CODE_MIDDLE,
     LINE_SAMPLES,
     PROMPT,
@@ -16,6 +14,8 @@ from ModuleUltrasoundLib.pic0rick_shell import (
     ZERO_AFTER_BANG,
     gain_db_of_code,
 )
+from ModuleUltrasoundLib.emulators.faults import SPLIT_S, Chunk, Faults
+from ModuleUltrasoundLib.emulators.line_source import LineSource, RawCodes
 
 LONGEST_COMMAND = 127  # characters; more are dropped silently
 BANG_ONSET = 22

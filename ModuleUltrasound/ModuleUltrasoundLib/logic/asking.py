@@ -14,9 +14,9 @@ from ModuleUltrasoundLib.logic.probing import ProbeStep
 from ModuleUltrasoundLib.panel_description import TOWARDS_TABLE
 
 if TYPE_CHECKING:
-    from ModuleUltrasoundLib.next_point import NextTarget
-    from ModuleUltrasoundLib.palpation import Palpation
-    from ModuleUltrasoundLib.protocol import ProtocolPoints
+    from ModuleUltrasoundLib.palpation.next_point import NextTarget
+    from ModuleUltrasoundLib.palpation.palpation import Palpation
+    from ModuleUltrasoundLib.palpation.protocol import ProtocolPoints
 
 
 class AskStep(ProbeStep):
@@ -72,21 +72,21 @@ class AskStep(ProbeStep):
         return np.isin(np.arange(count), list(self._passed))
 
     def _plan(self) -> ProtocolPoints:
-        from ModuleUltrasoundLib.protocol import ProtocolPoints
+        from ModuleUltrasoundLib.palpation.protocol import ProtocolPoints
 
         positions, normals, labels = self.protocolPoints()
         return ProtocolPoints(labels, positions, normals, labels)
 
     def _within_reach(self, plan: ProtocolPoints) -> npt.NDArray[np.bool_]:
         """The reference base stands on the head clamp: a probe that would run into it cannot be held there."""
-        from ModuleUltrasoundLib.next_point import reachable
+        from ModuleUltrasoundLib.palpation.next_point import reachable
 
         clamp = scene_data.get_transform("ReferenceToRas")[:3, 3][None] if registered() else None
         return reachable(plan, clamp, TOWARDS_TABLE[self.parameters().read().patient_lies])
 
     def _best(self, plan: ProtocolPoints, candidates: npt.NDArray[np.bool_], taken: list[int]) -> Optional[NextTarget]:
         """By the error of the registration in force, with the points taken since counted in; None where it is not known."""
-        from ModuleUltrasoundLib.next_point import DEFAULTS, choose_next, covariance_with
+        from ModuleUltrasoundLib.palpation.next_point import DEFAULTS, choose_next, covariance_with
 
         error = scene_data.get_motion_error() if registered() else None
         if error is None:

@@ -14,7 +14,7 @@ from CranioNavLib.sequence_metafile import read_recording
 from ModuleUltrasoundLib.logic.planning import ProtocolStep, count_of
 
 if TYPE_CHECKING:
-    from ModuleUltrasoundLib.speed_of_sound import SpeedEstimate
+    from ModuleUltrasoundLib.measurement.speed_of_sound import SpeedEstimate
 
 
 class MeasureStep(ProtocolStep):
@@ -26,8 +26,8 @@ class MeasureStep(ProtocolStep):
 
     def measureRecording(self) -> Task:
         """Find the bone in every line of `recording_path`; good ones become SurfacePoints."""
-        from ModuleUltrasoundLib.measure import bone_points, measure_lines
-        from ModuleUltrasoundLib.speed_of_sound import estimate_if_pressed
+        from ModuleUltrasoundLib.measurement.measure import bone_points, measure_lines
+        from ModuleUltrasoundLib.measurement.speed_of_sound import estimate_if_pressed
 
         wanted = self.parameters().read()
 

@@ -13,15 +13,15 @@ from CranioNavLib.module_logic import done_or
 from CranioNavLib.panel import Level, Reading, StepState, StepStatus, Task
 from CranioNavLib.rigid import Array, invert_rigid, transform_points
 
-from ModuleUltrasoundLib.line_stream import PosedLine
+from ModuleUltrasoundLib.devices.line_stream import PosedLine
 from ModuleUltrasoundLib.logic.measuring import MeasureStep
 from ModuleUltrasoundLib.logic.planning import count_of, registered
 from ModuleUltrasoundLib.logic.sweeping import SweepStep
 from ModuleUltrasoundLib.panel_description import PalpateBy
 
 if TYPE_CHECKING:
-    from ModuleUltrasoundLib.line_recorder import LineRecorder
-    from ModuleUltrasoundLib.palpation import Palpation, PalpationStatus
+    from ModuleUltrasoundLib.devices.line_recorder import LineRecorder
+    from ModuleUltrasoundLib.palpation.palpation import Palpation, PalpationStatus
 
 LEFT_MM = 10.0  # a resting probe wanders by 1 to 3 mm; the next point is centimetres away
 ENOUGH = 200  # points of a sweep after which stopping is suggested
@@ -60,8 +60,8 @@ class PalpationStep(SweepStep, MeasureStep):
 
     def startRecording(self) -> str:
         """Record every line with its pose into `recording_path`; points are taken where the probe rests, or as it glides."""
-        from ModuleUltrasoundLib.line_recorder import LineRecorder
-        from ModuleUltrasoundLib.palpation import Palpation, Sweep
+        from ModuleUltrasoundLib.devices.line_recorder import LineRecorder
+        from ModuleUltrasoundLib.palpation.palpation import Palpation, Sweep
 
         path = self.parameters().read().recording_path
         earlier = set_aside(path)
@@ -119,7 +119,7 @@ class PalpationStep(SweepStep, MeasureStep):
 
     def takePoints(self) -> None:
         """A point on which the probe has rested long enough is taken, and the next one is asked for; a sweep goes on."""
-        from ModuleUltrasoundLib.palpation import lines_of
+        from ModuleUltrasoundLib.palpation.palpation import lines_of
 
         if self.measured is None or (self.palpation is None and self.sweep is None):
             return
@@ -142,7 +142,7 @@ class PalpationStep(SweepStep, MeasureStep):
 
     def _showTaken(self, palpation: Palpation) -> None:
         """The points taken so far as SurfacePoints; measuring the whole recording replaces them at the end."""
-        from ModuleUltrasoundLib.palpation import to_bone_points
+        from ModuleUltrasoundLib.palpation.palpation import to_bone_points
 
         taken, wanted = palpation.taken, self.parameters().read()
         if not taken:

@@ -12,8 +12,8 @@ from CranioNavLib.panel import Reading, StepStatus
 from CranioNavLib.rigid import Array
 from CranioNavLib.slicer_files import LabelledPoints
 
-from ModuleUltrasoundLib.device import DeviceError
-from ModuleUltrasoundLib.line_stream import LineStream
+from ModuleUltrasoundLib.devices.device import DeviceError
+from ModuleUltrasoundLib.devices.line_stream import LineStream
 from ModuleUltrasoundLib.panel_description import UltrasoundParameters
 
 CURRENT_POINT = "current"  # parameter of the Protocol node: index of the point to palpate now
@@ -30,7 +30,7 @@ class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
 
     def planProtocol(self) -> str:
         """Place the palpation points on the outer table; writes ProtocolPoints and Protocol. Returns a message."""
-        from ModuleUltrasoundLib.protocol import plan_protocol
+        from ModuleUltrasoundLib.palpation.protocol import plan_protocol
 
         landmarks = scene_data.get_points("LandmarksCT") if count_of("LandmarksCT") else None
         planned = plan_protocol(

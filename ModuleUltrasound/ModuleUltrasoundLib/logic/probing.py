@@ -12,14 +12,14 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.panel import Level, Reading, StepStatus
 from CranioNavLib.rigid import Array
 
-from ModuleUltrasoundLib.line_stream import LinePoser, LineStream, PosedLine
+from ModuleUltrasoundLib.devices.line_stream import LinePoser, LineStream, PosedLine
 from ModuleUltrasoundLib.logic.planning import ProtocolStep, registered
 
 if TYPE_CHECKING:
     from CranioNavLib.surface import Surface
 
-    from ModuleUltrasoundLib.guidance import Guide
-    from ModuleUltrasoundLib.measure import LineMeasurements
+    from ModuleUltrasoundLib.measurement.measure import LineMeasurements
+    from ModuleUltrasoundLib.palpation.guidance import Guide
 
 LIVE_LINES = 12  # that the live depth is read from: a third of a second at 40 lines a second
 LIVE_EVERY_S = 0.2
@@ -84,8 +84,8 @@ class ProbeStep(ProtocolStep):
 
     def measureLive(self) -> bool:
         """A few times a second: the last line as a table, and what the last lines say; whether it was time for it."""
-        from ModuleUltrasoundLib.line_stream import recording_of
-        from ModuleUltrasoundLib.measure import measure_lines
+        from ModuleUltrasoundLib.devices.line_stream import recording_of
+        from ModuleUltrasoundLib.measurement.measure import measure_lines
 
         now = time.monotonic()
         if not self.latest or now < self._measuredTime + LIVE_EVERY_S:
@@ -99,7 +99,7 @@ class ProbeStep(ProtocolStep):
 
     def steer(self) -> None:
         """Where the probe stands to the bone it has to see, under the registration in force."""
-        from ModuleUltrasoundLib.guidance import guide
+        from ModuleUltrasoundLib.palpation.guidance import guide
 
         pose, table = scene_data.get_pose("ProbeToReference"), scene.find("OuterTable")
         self._guide = None
@@ -153,7 +153,7 @@ class ProbeStep(ProtocolStep):
 
     def depth(self) -> Optional[Reading]:
         """The bone's depth under the probe now; None while there is no trustworthy echo."""
-        from ModuleUltrasoundLib.quality import reason_in_words
+        from ModuleUltrasoundLib.measurement.quality import reason_in_words
 
         if self.measured is None or not len(self.measured):
             return None

@@ -14,7 +14,7 @@ from ModuleUltrasoundLib.logic.asking import AskStep
 if TYPE_CHECKING:
     from CranioNavLib.surface import Surface
 
-    from ModuleUltrasoundLib.palpation import PalpationLine, Sweep
+    from ModuleUltrasoundLib.palpation.palpation import PalpationLine, Sweep
 
 SHOWN_EVERY_S = 1.0
 SHARE_OF_TIME = 0.1  # spent on showing points, at most: there may be thousands
@@ -50,7 +50,7 @@ class SweepStep(AskStep):
 
     def showSweep(self) -> None:
         """The sweep so far as SurfacePoints; measuring the whole recording replaces them at the end."""
-        from ModuleUltrasoundLib.palpation import to_bone_points
+        from ModuleUltrasoundLib.palpation.palpation import to_bone_points
 
         assert self.sweep is not None
         began, wanted = time.monotonic(), self.parameters().read()

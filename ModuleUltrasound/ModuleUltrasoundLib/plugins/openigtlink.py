@@ -13,9 +13,9 @@ from CranioNavLib.openigtlink.messages import Image, Message
 from CranioNavLib.parameters import Limits
 from CranioNavLib.sequence_metafile import Acquisition
 
-from ModuleUltrasoundLib.amode_settings import AModeSettings
-from ModuleUltrasoundLib.connection import DeviceState
-from ModuleUltrasoundLib.device import AModeDevice, DeviceError, RfLine
+from ModuleUltrasoundLib.devices.amode_settings import AModeSettings
+from ModuleUltrasoundLib.devices.connection import DeviceState
+from ModuleUltrasoundLib.devices.device import AModeDevice, DeviceError, RfLine
 
 INT16_ENDS = (-32768, 32767)
 CLOCKS_AGREE_S = 0.5  # a sender's time stamp that differs more from this computer's clock says nothing here

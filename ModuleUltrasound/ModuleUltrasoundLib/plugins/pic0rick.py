@@ -14,11 +14,11 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.parameters import Limits
 from CranioNavLib.sequence_metafile import Acquisition
 
-from ModuleUltrasoundLib import pic0rick_shell as shell
-from ModuleUltrasoundLib.amode_settings import AModeSettings, Trigger
-from ModuleUltrasoundLib.connection import ByteLink, usb_ports, usb_product
-from ModuleUltrasoundLib.device import DeviceError, RfLine
-from ModuleUltrasoundLib.linked_device import LinkedDevice
+from ModuleUltrasoundLib.devices import pic0rick_shell as shell
+from ModuleUltrasoundLib.devices.amode_settings import AModeSettings, Trigger
+from ModuleUltrasoundLib.devices.connection import ByteLink, usb_ports, usb_product
+from ModuleUltrasoundLib.devices.device import DeviceError, RfLine
+from ModuleUltrasoundLib.devices.linked_device import LinkedDevice
 
 OPEN_S = 5.0  # to find the prompt
 SETTLE_S = 0.5  # after opening; the firmware waits 0.4 s for the port before it prints

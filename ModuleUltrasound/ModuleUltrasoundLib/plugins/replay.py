@@ -11,7 +11,7 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.parameters import Limits, Parameters
 from CranioNavLib.sequence_metafile import Acquisition, Recording, read_recording
 
-from ModuleUltrasoundLib.device import AModeDevice, DeviceError, RfLine
+from ModuleUltrasoundLib.devices.device import AModeDevice, DeviceError, RfLine
 
 INT16_ENDS = (-32768, 32767)
 

@@ -1,4 +1,4 @@
-"""Pulser/receivers that speak the framed protocol of `ModuleUltrasoundLib.framed` on a serial port or socket."""
+"""Pulser/receivers that speak the framed protocol of `ModuleUltrasoundLib.devices.framed` on a serial port or socket."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.parameters import Limits
 from CranioNavLib.sequence_metafile import Acquisition
 
-from ModuleUltrasoundLib.amode_settings import AModeSettings, Trigger
-from ModuleUltrasoundLib.connection import ByteLink
-from ModuleUltrasoundLib.device import DeviceError, RfLine
-from ModuleUltrasoundLib.framed import KIND_LINE, Frame, FrameDecoder, encode_command, parse_pairs
-from ModuleUltrasoundLib.linked_device import LinkedDevice
+from ModuleUltrasoundLib.devices.amode_settings import AModeSettings, Trigger
+from ModuleUltrasoundLib.devices.connection import ByteLink
+from ModuleUltrasoundLib.devices.device import DeviceError, RfLine
+from ModuleUltrasoundLib.devices.framed import KIND_LINE, Frame, FrameDecoder, encode_command, parse_pairs
+from ModuleUltrasoundLib.devices.linked_device import LinkedDevice
 
 ANSWER_S = 1.0
 ATTEMPTS = 4  # of a command whose answer does not come: bytes were lost on the way

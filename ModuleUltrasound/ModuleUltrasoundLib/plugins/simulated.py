@@ -12,7 +12,7 @@ from CranioNavLib.phantom.session import SimulatedSession
 from CranioNavLib.phantom.simulated_device import Head, SimulatedDevice
 from CranioNavLib.sequence_metafile import Acquisition
 
-from ModuleUltrasoundLib.device import AMODE_DEVICES, AModeDevice, DeviceError, RfLine
+from ModuleUltrasoundLib.devices.device import AMODE_DEVICES, AModeDevice, DeviceError, RfLine
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 from CranioNavLib.sequence_metafile import Acquisition, Recording, write_recording
-from ModuleUltrasoundLib.device import AMODE_DEVICES
+from ModuleUltrasoundLib.devices.device import AMODE_DEVICES
 from ModuleUltrasoundLib.emulators.faults import DEFAULT_RATES, Faults
 
 

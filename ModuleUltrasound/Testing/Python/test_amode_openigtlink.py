@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from CranioNavLib.openigtlink import IgtlServer, encode
 from CranioNavLib.openigtlink.messages import Image, String, a_line_image
-from ModuleUltrasoundLib.connection import DeviceState
-from ModuleUltrasoundLib.device import AMODE_DEVICES, DeviceError
+from ModuleUltrasoundLib.devices.connection import DeviceState
+from ModuleUltrasoundLib.devices.device import AMODE_DEVICES, DeviceError
 
 
 def a_line(seed: int, count: int = 3000) -> np.ndarray:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition
-from ModuleUltrasoundLib.depth import bending_sd_deg, bone_positions, covariances, refracted_angle_deg
+from ModuleUltrasoundLib.measurement.depth import bending_sd_deg, bone_positions, covariances, refracted_angle_deg
 
 
 def test_refraction_follows_snell():

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from CranioNavLib.plugins import load_file
-from ModuleUltrasoundLib.connection import DeviceState
-from ModuleUltrasoundLib.device import AMODE_DEVICES, DeviceError
+from ModuleUltrasoundLib.devices.connection import DeviceState
+from ModuleUltrasoundLib.devices.device import AMODE_DEVICES, DeviceError
 from ModuleUltrasoundLib.emulators.faults import Chunk, Faults
 from ModuleUltrasoundLib.emulators.server import served
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ModuleUltrasoundLib.echo_candidates import (
+from ModuleUltrasoundLib.echo.candidates import (
     CANDIDATES,
     find_candidates,
     logarithm,
@@ -12,7 +12,7 @@ from ModuleUltrasoundLib.echo_candidates import (
     salient_peaks,
     take_levels,
 )
-from ModuleUltrasoundLib.signal_chain import Envelopes
+from ModuleUltrasoundLib.echo.signal_chain import Envelopes
 
 RATE = 20e6
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
-from ModuleUltrasoundLib.echo_candidates import CANDIDATES, Candidates
-from ModuleUltrasoundLib.echo_features import NAMES, line_features
-from ModuleUltrasoundLib.signal_forerun import Forerun
+from ModuleUltrasoundLib.echo.candidates import CANDIDATES, Candidates
+from ModuleUltrasoundLib.echo.features import NAMES, line_features
+from ModuleUltrasoundLib.echo.forerun import Forerun
 
 SPEED = 1540.0
 SKIN_S = 17e-6

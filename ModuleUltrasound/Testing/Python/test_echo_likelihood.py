@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from ModuleUltrasoundLib.echo_likelihood import DepthMap, Echoes, Neighbours, contact, relative_polarity
+from ModuleUltrasoundLib.echo.likelihood import DepthMap, Echoes, Neighbours, contact, relative_polarity
 
 
 def test_polarity_is_that_of_the_likely_bones_and_silent_when_they_disagree():

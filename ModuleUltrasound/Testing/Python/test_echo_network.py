@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from ModuleUltrasoundLib.echo_network import Likelihood, Network, learnt, probabilities, read_likelihood, write_likelihood
+from ModuleUltrasoundLib.echo.network import Likelihood, Network, learnt, probabilities, read_likelihood, write_likelihood
 from scipy.special import softmax
 
 
@@ -52,8 +52,8 @@ def test_likelihood_comes_back_from_its_file_to_four_digits(a_network, tmp_path)
 
 
 def test_networks_that_were_learnt_take_the_features_that_are_made():
-    from ModuleUltrasoundLib.echo_features import NAMES
-    from ModuleUltrasoundLib.echo_likelihood import SHARED_NAMES
+    from ModuleUltrasoundLib.echo.features import NAMES
+    from ModuleUltrasoundLib.echo.likelihood import SHARED_NAMES
 
     own, shared = len(NAMES), len(NAMES) + len(SHARED_NAMES)
     assert [network.layers[0][0].shape[0] for network in learnt().networks] == [own] + [shared] * (len(learnt().networks) - 1)

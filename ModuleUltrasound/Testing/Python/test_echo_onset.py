@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 from CranioNavLib.sequence_metafile import Acquisition
-from ModuleUltrasoundLib.echo_onset import delay_from_bang, delay_from_shape, pulse_delay
-from ModuleUltrasoundLib.echo_timing import BEFORE, BEHIND, Pulse
-from ModuleUltrasoundLib.signal_chain import complex_envelopes, design_band
+from ModuleUltrasoundLib.echo.onset import delay_from_bang, delay_from_shape, pulse_delay
+from ModuleUltrasoundLib.echo.signal_chain import complex_envelopes, design_band
+from ModuleUltrasoundLib.echo.timing import BEFORE, BEHIND, Pulse
 
 RATE, CENTRE = 60e6, 5e6
 

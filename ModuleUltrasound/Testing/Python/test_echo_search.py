@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.sequence_metafile import Acquisition, Recording
-from ModuleUltrasoundLib import echo_search
-from ModuleUltrasoundLib.echo_features import CLEAR_DB
-from ModuleUltrasoundLib.echo_search import KEPT, check_length, search_lines
-from ModuleUltrasoundLib.echo_timing import BEFORE
+from ModuleUltrasoundLib.echo import search as echo_search
+from ModuleUltrasoundLib.echo.features import CLEAR_DB
+from ModuleUltrasoundLib.echo.search import KEPT, check_length, search_lines
+from ModuleUltrasoundLib.echo.timing import BEFORE
 
 ACQUISITION = Acquisition(60e6, 5e6, 20.0, 2340.0)
 

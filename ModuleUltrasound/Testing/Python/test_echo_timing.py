@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from ModuleUltrasoundLib.echo_timing import BEFORE, BEHIND, learn_pulse, shift_windows, time_echoes
+from ModuleUltrasoundLib.echo.timing import BEFORE, BEHIND, learn_pulse, shift_windows, time_echoes
 
 RATE, CARRIER, CENTRE = 20e6, 4.6e6, 5e6
 WIDTH = 2.2  # samples

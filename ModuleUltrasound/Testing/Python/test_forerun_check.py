@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition, Recording
-from ModuleUltrasoundLib.forerun_check import forerun_remark
+from ModuleUltrasoundLib.measurement.forerun_check import forerun_remark
 
 
 def lines_with_forerun(length_mm, stated_mm, count=24, one_place=False):

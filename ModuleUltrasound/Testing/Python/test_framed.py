@@ -7,7 +7,7 @@ import pytest
 from CranioNavLib.errors import InputError
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ModuleUltrasoundLib.framed import (
+from ModuleUltrasoundLib.devices.framed import (
     KIND_LINE,
     KIND_TEXT,
     Frame,

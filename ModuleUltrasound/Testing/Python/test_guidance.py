@@ -8,7 +8,7 @@ from CranioNavLib.rigid import rigid
 from CranioNavLib.surface import Surface
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ModuleUltrasoundLib.guidance import (
+from ModuleUltrasoundLib.palpation.guidance import (
     bone_normal,
     cue,
     direction_in_words,

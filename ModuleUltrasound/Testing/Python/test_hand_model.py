@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from CranioNavLib.surface import Surface
-from ModuleUltrasoundLib.hand_model import (
+from ModuleUltrasoundLib.palpation.hand_model import (
     DIFFUSE_FLOOR_DB,
     GuidedUser,
     Hand,
@@ -16,7 +16,7 @@ from ModuleUltrasoundLib.hand_model import (
     UnguidedUser,
     echo_db,
 )
-from ModuleUltrasoundLib.protocol import ProtocolPoints, plan_protocol
+from ModuleUltrasoundLib.palpation.protocol import ProtocolPoints, plan_protocol
 from vtkmodules.vtkFiltersSources import vtkSphereSource
 
 STEP_S = 0.01

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from ModuleUltrasoundLib.lean import ONE_THREAD, clip, median, pick, product, without_nan
+from ModuleUltrasoundLib.echo.lean import ONE_THREAD, clip, median, pick, product, without_nan
 
 NUMBERS = arrays(float, st.integers(1, 9), elements=st.floats(-1e6, 1e6))
 

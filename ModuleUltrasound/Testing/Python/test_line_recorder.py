@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from CranioNavLib.sequence_metafile import Acquisition, read_recording
 from ModuleTrackingLib.tracker import PoseStatus, ToolPose
-from ModuleUltrasoundLib.device import RfLine
-from ModuleUltrasoundLib.line_recorder import LineRecorder
-from ModuleUltrasoundLib.line_stream import PosedLine
+from ModuleUltrasoundLib.devices.device import RfLine
+from ModuleUltrasoundLib.devices.line_recorder import LineRecorder
+from ModuleUltrasoundLib.devices.line_stream import PosedLine
 
 
 def line_at(time_s, value, status=PoseStatus.OK, point=-1):

@@ -9,8 +9,8 @@ import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition
-from ModuleUltrasoundLib.device import AModeDevice, DeviceError, RfLine
-from ModuleUltrasoundLib.line_stream import LinePoser, LineStream, recording_of
+from ModuleUltrasoundLib.devices.device import AModeDevice, DeviceError, RfLine
+from ModuleUltrasoundLib.devices.line_stream import LinePoser, LineStream, recording_of
 
 ACQUISITION = Acquisition(50e6, 5e6)
 

@@ -6,8 +6,8 @@ import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition, Recording
-from ModuleUltrasoundLib.echo_network import learnt
-from ModuleUltrasoundLib.measure import EchoSettings, measure_lines, several_spots, stays
+from ModuleUltrasoundLib.echo.network import learnt
+from ModuleUltrasoundLib.measurement.measure import EchoSettings, measure_lines, several_spots, stays
 
 SPEED = 1500.0
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition, Recording
-from ModuleUltrasoundLib.measure import LineMeasurements
-from ModuleUltrasoundLib.measure_points import HAND_SD_MM, SPACING_MM, bone_points, thin
+from ModuleUltrasoundLib.measurement.measure import LineMeasurements
+from ModuleUltrasoundLib.measurement.points import HAND_SD_MM, SPACING_MM, bone_points, thin
 from scipy.spatial.distance import pdist, squareform
 
 

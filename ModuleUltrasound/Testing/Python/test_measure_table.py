@@ -2,8 +2,8 @@ import csv
 
 import numpy as np
 from CranioNavLib.sequence_metafile import Acquisition, Recording
-from ModuleUltrasoundLib.measure import LineMeasurements
-from ModuleUltrasoundLib.measure_table import write_depths_csv
+from ModuleUltrasoundLib.measurement.measure import LineMeasurements
+from ModuleUltrasoundLib.measurement.table import write_depths_csv
 
 
 def test_table_has_the_contracts_columns_and_empty_cells_where_nothing_is_known(tmp_path):

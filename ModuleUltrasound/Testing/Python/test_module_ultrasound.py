@@ -16,7 +16,7 @@ from CranioNavLib.sequence_metafile import Acquisition, Recording, read_recordin
 from CranioNavLib.slicer_files import LabelledPoints, load_scene, save_scene
 from CranioNavLib.surface import Surface
 from ModuleUltrasoundLib import panel_description as module_panel
-from ModuleUltrasoundLib.device import AMODE_DEVICES, AModeDevice, RfLine
+from ModuleUltrasoundLib.devices.device import AMODE_DEVICES, AModeDevice, RfLine
 
 import ModuleUltrasound as module
 

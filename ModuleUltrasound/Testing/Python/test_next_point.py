@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import rigid_from_vector, transform_points
-from ModuleUltrasoundLib.next_point import choose_next, covariance_with, motion_rows, reachable, rms_tre_mm
-from ModuleUltrasoundLib.protocol import ProtocolPoints
+from ModuleUltrasoundLib.palpation.next_point import choose_next, covariance_with, motion_rows, reachable, rms_tre_mm
+from ModuleUltrasoundLib.palpation.protocol import ProtocolPoints
 
 CENTER = np.array([10.0, -60.0, 40.0])
 

@@ -7,8 +7,8 @@ import pytest
 from CranioNavLib.errors import InputError
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ModuleUltrasoundLib.measure import LineMeasurements
-from ModuleUltrasoundLib.palpation import (
+from ModuleUltrasoundLib.measurement.measure import LineMeasurements
+from ModuleUltrasoundLib.palpation.palpation import (
     Palpation,
     PalpationLine,
     PalpationSettings,

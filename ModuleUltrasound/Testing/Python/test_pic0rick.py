@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.sequence_metafile import Acquisition, Recording, write_recording
-from ModuleUltrasoundLib import pic0rick_shell as shell
-from ModuleUltrasoundLib.connection import DeviceState
-from ModuleUltrasoundLib.device import AMODE_DEVICES, DeviceError
+from ModuleUltrasoundLib.devices import pic0rick_shell as shell
+from ModuleUltrasoundLib.devices.connection import DeviceState
+from ModuleUltrasoundLib.devices.device import AMODE_DEVICES, DeviceError
 from ModuleUltrasoundLib.emulators.faults import Chunk, Faults
 from ModuleUltrasoundLib.emulators.line_source import RawCodes, RecordedLines
 from ModuleUltrasoundLib.emulators.pic0rick_shell import Pic0rickShell

@@ -7,7 +7,7 @@ import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import invert_rigid, rigid_from_vector, transform_directions, transform_points
 from CranioNavLib.surface import Surface
-from ModuleUltrasoundLib.protocol import LANDMARK_LABELS, REGIONS, _first_dip, plan_protocol, probe_footprint
+from ModuleUltrasoundLib.palpation.protocol import LANDMARK_LABELS, REGIONS, _first_dip, plan_protocol, probe_footprint
 
 COUNTS = {"Left lateral": 3, "Right lateral": 3, "Frontal convexity": 4, "Forehead": 4, "Periorbital": 4}
 # Nasion at the origin of the head built below
@@ -176,5 +176,5 @@ def test_a_probe_cannot_stand_at_an_edge_or_on_a_step():
 
 def test_two_dips_that_disagree_still_give_a_nasion(a_skull, monkeypatch):
     dips = iter([30, None, 80] + [None] * 50)
-    monkeypatch.setattr("ModuleUltrasoundLib.protocol._first_dip", lambda profile: next(dips))
+    monkeypatch.setattr("ModuleUltrasoundLib.palpation.protocol._first_dip", lambda profile: next(dips))
     assert np.isfinite(plan_protocol(a_skull).head_to_ras).all()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition, Recording
-from ModuleUltrasoundLib.quality import choose, clipped_share, converter_limits, quality_of, reasons_of, unstable
+from ModuleUltrasoundLib.measurement.quality import choose, clipped_share, converter_limits, quality_of, reasons_of, unstable
 
 
 def a_recording(count=20, lines=None, statuses=None):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.sequence_metafile import Acquisition, Recording, write_recording
-from ModuleUltrasoundLib.device import AMODE_DEVICES, DeviceError
+from ModuleUltrasoundLib.devices.device import AMODE_DEVICES, DeviceError
 
 
 @pytest.fixture

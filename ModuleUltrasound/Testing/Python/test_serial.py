@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.sequence_metafile import Acquisition, Recording
-from ModuleUltrasoundLib.connection import ByteLink, DeviceState
-from ModuleUltrasoundLib.device import AMODE_DEVICES, DeviceError
+from ModuleUltrasoundLib.devices.connection import ByteLink, DeviceState
+from ModuleUltrasoundLib.devices.device import AMODE_DEVICES, DeviceError
 from ModuleUltrasoundLib.emulators.amode_serial import SerialPulser
 from ModuleUltrasoundLib.emulators.faults import Faults
 from ModuleUltrasoundLib.emulators.line_source import RecordedLines

@@ -4,8 +4,8 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.sequence_metafile import Acquisition
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from ModuleUltrasoundLib.echo_candidates import refine_peaks
-from ModuleUltrasoundLib.signal_chain import check_acquisition, complex_envelopes, design_band
+from ModuleUltrasoundLib.echo.candidates import refine_peaks
+from ModuleUltrasoundLib.echo.signal_chain import check_acquisition, complex_envelopes, design_band
 
 
 def gaussian_echo(time_s, centre_hz, at_s, phase=0.0, bandwidth=0.6):

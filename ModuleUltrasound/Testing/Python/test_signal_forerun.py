@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 from CranioNavLib.sequence_metafile import Acquisition
-from ModuleUltrasoundLib.echo_candidates import rough_noise
-from ModuleUltrasoundLib.signal_chain import complex_envelopes, design_band
-from ModuleUltrasoundLib.signal_forerun import find_forerun, nominal_skin_s, steady, suppress_multiples
+from ModuleUltrasoundLib.echo.candidates import rough_noise
+from ModuleUltrasoundLib.echo.forerun import find_forerun, nominal_skin_s, steady, suppress_multiples
+from ModuleUltrasoundLib.echo.signal_chain import complex_envelopes, design_band
 
 ACQUISITION = Acquisition(60e6, 5e6, 20.0, 2340.0)
 SKIN_S = 2e-3 * 20 / 2340

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from CranioNavLib.sequence_metafile import Acquisition
-from ModuleUltrasoundLib.echo_candidates import refine_peaks
-from ModuleUltrasoundLib.signal_chain import complex_envelopes, design_band
+from ModuleUltrasoundLib.echo.candidates import refine_peaks
+from ModuleUltrasoundLib.echo.signal_chain import complex_envelopes, design_band
 
 WATER_M_S, STEEL_M_S = 1480.0, 5950.0
 RATE_HZ = 60e6

@@ -7,7 +7,7 @@ import pytest
 from CranioNavLib.phantom import make_patient
 from CranioNavLib.phantom.session import SimulatedSession, SteppedClock, use_session
 from CranioNavLib.phantom.sites import outer_seats
-from ModuleUltrasoundLib.device import AMODE_DEVICES, DeviceError
+from ModuleUltrasoundLib.devices.device import AMODE_DEVICES, DeviceError
 
 
 @pytest.fixture

@@ -3,8 +3,8 @@ import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition, Recording
-from ModuleUltrasoundLib.measure import LineMeasurements
-from ModuleUltrasoundLib.speed_of_sound import estimate_if_pressed, estimate_speed
+from ModuleUltrasoundLib.measurement.measure import LineMeasurements
+from ModuleUltrasoundLib.measurement.speed_of_sound import estimate_if_pressed, estimate_speed
 
 
 def pressed(rng, true_speed, spots=8, frames=40, noise_mm=0.0, press_mm=2.0, slope=0.0, drift_mm=0.0):

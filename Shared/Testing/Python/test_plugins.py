@@ -124,7 +124,7 @@ def test_every_built_in_plugin_loads():
     from ModuleRegistrationLib.anatomy.segmentation import SEGMENTATIONS
     from ModuleRegistrationLib.registration.problem import METHODS
     from ModuleTrackingLib.tracker import TRACKERS
-    from ModuleUltrasoundLib.device import AMODE_DEVICES
+    from ModuleUltrasoundLib.devices.device import AMODE_DEVICES
 
     for kind in (TRACKERS, AMODE_DEVICES, METHODS, SEGMENTATIONS):
         assert kind.names()

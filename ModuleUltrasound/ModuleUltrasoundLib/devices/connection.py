@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 from CranioNavLib.errors import InputError
 
-from ModuleUltrasoundLib.device import DeviceError
+from ModuleUltrasoundLib.devices.device import DeviceError
 
 BOOTLOADER_BAUD = 1200  # opening an RP2040/RP2350 board at this rate reboots it into its bootloader
 READ_SLICE_S = 0.02  # longest wait inside one read of the port, so that deadlines hold to this

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.rigid import Array
 
-from ModuleUltrasoundLib.lean import at_samples, clip, median
-from ModuleUltrasoundLib.signal_chain import Envelopes, Floats
+from ModuleUltrasoundLib.echo.lean import at_samples, clip, median
+from ModuleUltrasoundLib.echo.signal_chain import Envelopes, Floats
 
 CANDIDATES = 8  # echoes kept of a line
 NOISE_BLOCKS = 10

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.rigid import Array
 
-from ModuleUltrasoundLib.lean import clip
+from ModuleUltrasoundLib.echo.lean import clip
 
 Complexes = npt.NDArray[np.complex64]
 

@@ -16,7 +16,7 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Recording
 
-from ModuleUltrasoundLib.measure import LineMeasurements, stays
+from ModuleUltrasoundLib.measurement.measure import LineMeasurements, stays
 
 LEAST_FRAMES = 8  # accepted frames of a spot
 LEAST_RANGE_MM = 0.4  # of tissue depth at a spot, 10th to 90th percentile; less pressing tells nothing

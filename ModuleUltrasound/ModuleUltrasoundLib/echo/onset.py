@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.rigid import Array
 
-from ModuleUltrasoundLib.echo_timing import BEFORE, BEHIND, LEAST_LINES, Pulse
-from ModuleUltrasoundLib.signal_chain import BAND_WIDTH
+from ModuleUltrasoundLib.echo.signal_chain import BAND_WIDTH
+from ModuleUltrasoundLib.echo.timing import BEFORE, BEHIND, LEAST_LINES, Pulse
 
 SMEAR_CYCLES = 2.3548 / (2 * np.pi * BAND_WIDTH)  # standard deviation in time of the band-pass
 GAMMA_SHAPES = (1.0, 1.5, 2.0, 3.0, 4.0)  # of t^(k-1) exp(-t/theta): abrupt onset to slow build-up

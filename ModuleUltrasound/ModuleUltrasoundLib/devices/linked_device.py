@@ -8,8 +8,8 @@ from abc import abstractmethod
 from collections import Counter
 from typing import Any, Optional
 
-from ModuleUltrasoundLib.connection import ByteLink, DeviceState, LinkLostError
-from ModuleUltrasoundLib.device import AModeDevice, DeviceError, RfLine
+from ModuleUltrasoundLib.devices.connection import ByteLink, DeviceState, LinkLostError
+from ModuleUltrasoundLib.devices.device import AModeDevice, DeviceError, RfLine
 
 RETRY_S = 1.0  # between two attempts to reach a lost device
 

@@ -14,7 +14,7 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.parameters import Limits, Parameters
 from CranioNavLib.rigid import Array, check_points
 
-from ModuleUltrasoundLib.protocol import ProtocolPoints
+from ModuleUltrasoundLib.palpation.protocol import ProtocolPoints
 
 PROBE_LENGTH_MM = 150.0  # what a probe with the hand takes up outside the head
 

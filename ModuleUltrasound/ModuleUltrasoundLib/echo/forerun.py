@@ -13,10 +13,10 @@ import numpy.typing as npt
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Acquisition
 
-from ModuleUltrasoundLib.echo_candidates import fit_tops
-from ModuleUltrasoundLib.echo_timing import shift_columns
-from ModuleUltrasoundLib.lean import at_samples, clip, median
-from ModuleUltrasoundLib.signal_chain import Envelopes
+from ModuleUltrasoundLib.echo.candidates import fit_tops
+from ModuleUltrasoundLib.echo.lean import at_samples, clip, median
+from ModuleUltrasoundLib.echo.signal_chain import Envelopes
+from ModuleUltrasoundLib.echo.timing import shift_columns
 
 SEARCH = 0.04  # of the nominal time: temperature changes the delay line's speed by 1 to 3 %, and its length is machined
 SEARCH_S = 4e-7  # on top: the pulse's own delay

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from CranioNavLib.sequence_metafile import Recording
 
-from ModuleUltrasoundLib.echo_candidates import rough_noise
-from ModuleUltrasoundLib.measure import several_spots, stays
-from ModuleUltrasoundLib.signal_chain import check_acquisition, complex_envelopes, design_band
-from ModuleUltrasoundLib.signal_forerun import SEARCH, SEARCH_S, find_forerun, nominal_skin_s
+from ModuleUltrasoundLib.echo.candidates import rough_noise
+from ModuleUltrasoundLib.echo.forerun import SEARCH, SEARCH_S, find_forerun, nominal_skin_s
+from ModuleUltrasoundLib.echo.signal_chain import check_acquisition, complex_envelopes, design_band
+from ModuleUltrasoundLib.measurement.measure import several_spots, stays
 
 LINES = 64  # that are looked at
 LEAST_LINES = 8

@@ -12,12 +12,12 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Acquisition, Recording
 
-from ModuleUltrasoundLib.echo_candidates import Candidates, concatenate, find_candidates, reorder, rough_noise
-from ModuleUltrasoundLib.echo_features import line_features
-from ModuleUltrasoundLib.echo_timing import BEFORE, BEHIND, Complexes
-from ModuleUltrasoundLib.lean import at_samples, clip, pick, without_nan
-from ModuleUltrasoundLib.signal_chain import Band, Envelopes, check_acquisition, design_band, envelopes_of
-from ModuleUltrasoundLib.signal_forerun import Forerun, find_forerun, nominal_skin_s, steady, suppress_multiples
+from ModuleUltrasoundLib.echo.candidates import Candidates, concatenate, find_candidates, reorder, rough_noise
+from ModuleUltrasoundLib.echo.features import line_features
+from ModuleUltrasoundLib.echo.forerun import Forerun, find_forerun, nominal_skin_s, steady, suppress_multiples
+from ModuleUltrasoundLib.echo.lean import at_samples, clip, pick, without_nan
+from ModuleUltrasoundLib.echo.signal_chain import Band, Envelopes, check_acquisition, design_band, envelopes_of
+from ModuleUltrasoundLib.echo.timing import BEFORE, BEHIND, Complexes
 
 BANG_SAMPLES = 40  # ten cycles
 KEPT = 3  # candidates of a line whose echo is kept sample by sample

@@ -15,7 +15,7 @@ from CranioNavLib.sequence_metafile import Acquisition, Recording
 from ModuleTrackingLib.pose_history import PoseHistory
 from ModuleTrackingLib.tracker import PoseStatus, ToolPose
 
-from ModuleUltrasoundLib.device import AModeDevice, DeviceError, RfLine
+from ModuleUltrasoundLib.devices.device import AModeDevice, DeviceError, RfLine
 
 QUEUE_LINES = 2048  # ten seconds at 200 lines a second: longer than any redraw blocks the main thread
 LONGEST_WAIT_S = 0.3  # a line waits so long for the pose after it: longer than redraws keep the poses from being taken over

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from CranioNavLib.sequence_metafile import Acquisition, RecordingWriter
 
-from ModuleUltrasoundLib.device import RfLine
-from ModuleUltrasoundLib.line_stream import PosedLine, status_word
+from ModuleUltrasoundLib.devices.device import RfLine
+from ModuleUltrasoundLib.devices.line_stream import PosedLine, status_word
 
 
 class LineRecorder:

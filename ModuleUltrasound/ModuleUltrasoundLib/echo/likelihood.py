@@ -16,10 +16,10 @@ import numpy.typing as npt
 import scipy
 from CranioNavLib.rigid import Array
 
-from ModuleUltrasoundLib.echo_candidates import DECIBEL, Candidates
-from ModuleUltrasoundLib.echo_network import Likelihood, probabilities
-from ModuleUltrasoundLib.echo_search import Found
-from ModuleUltrasoundLib.lean import median, product, without_nan
+from ModuleUltrasoundLib.echo.candidates import DECIBEL, Candidates
+from ModuleUltrasoundLib.echo.lean import median, product, without_nan
+from ModuleUltrasoundLib.echo.network import Likelihood, probabilities
+from ModuleUltrasoundLib.echo.search import Found
 
 SAME_MM = 0.35  # SD of a hand's tremor along the beam from line to line: how near candidates support each other
 BIN_MM = 0.2

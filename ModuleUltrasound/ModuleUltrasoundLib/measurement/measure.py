@@ -11,15 +11,23 @@ from CranioNavLib.parameters import Limits, Parameters
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Recording
 
-from ModuleUltrasoundLib.depth import bone_positions, covariances
-from ModuleUltrasoundLib.echo_likelihood import SHARED_NAMES, judge_echoes
-from ModuleUltrasoundLib.echo_network import Likelihood, learnt
-from ModuleUltrasoundLib.echo_onset import pulse_delay
-from ModuleUltrasoundLib.echo_search import Found, search_lines
-from ModuleUltrasoundLib.echo_timing import time_echoes
-from ModuleUltrasoundLib.lean import median, without_nan
-from ModuleUltrasoundLib.measure_points import bone_points as bone_points
-from ModuleUltrasoundLib.quality import CLIPPED_SHARE, TOLERANCE_MM, choose, clipped_share, quality_of, reasons_of, unstable
+from ModuleUltrasoundLib.echo.lean import median, without_nan
+from ModuleUltrasoundLib.echo.likelihood import SHARED_NAMES, judge_echoes
+from ModuleUltrasoundLib.echo.network import Likelihood, learnt
+from ModuleUltrasoundLib.echo.onset import pulse_delay
+from ModuleUltrasoundLib.echo.search import Found, search_lines
+from ModuleUltrasoundLib.echo.timing import time_echoes
+from ModuleUltrasoundLib.measurement.depth import bone_positions, covariances
+from ModuleUltrasoundLib.measurement.points import bone_points as bone_points
+from ModuleUltrasoundLib.measurement.quality import (
+    CLIPPED_SHARE,
+    TOLERANCE_MM,
+    choose,
+    clipped_share,
+    quality_of,
+    reasons_of,
+    unstable,
+)
 
 LEAST_ALTERNATIVE = 0.01  # less probable echoes are not handed on
 SAME_SPOT_MM = 5.0

@@ -1,4 +1,4 @@
-"""The small networks that score echoes, and the numbers that were learnt for them (echo_weights.json)."""
+"""The small networks that score echoes, and the numbers that were learnt for them (weights.json)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.rigid import Array
 
-WEIGHTS = Path(__file__).with_name("echo_weights.json")  # written by Testing/Studies/calibrate_echo.py
+WEIGHTS = Path(__file__).with_name("weights.json")  # written by Testing/Studies/calibrate_echo.py
 ROWS = 256  # lines whose scores are worked out at once: the layers stay in the processor's cache
 
 Weights = npt.NDArray[np.float32]

@@ -16,7 +16,7 @@ from CranioNavLib.parameters import Limits, Parameters
 from CranioNavLib.rigid import Array
 
 if TYPE_CHECKING:
-    from ModuleUltrasoundLib.measure import LineMeasurements
+    from ModuleUltrasoundLib.measurement.measure import LineMeasurements
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import scipy
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Recording
 
-from ModuleUltrasoundLib.lean import clip, pick, without_nan
+from ModuleUltrasoundLib.echo.lean import clip, pick, without_nan
 
 Bools = npt.NDArray[np.bool_]
 

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.rigid import Array
 
-from ModuleUltrasoundLib.echo_candidates import DECIBEL, Candidates
-from ModuleUltrasoundLib.signal_chain import Floats
-from ModuleUltrasoundLib.signal_forerun import MULTIPLES, Forerun
+from ModuleUltrasoundLib.echo.candidates import DECIBEL, Candidates
+from ModuleUltrasoundLib.echo.forerun import MULTIPLES, Forerun
+from ModuleUltrasoundLib.echo.signal_chain import Floats
 
 FAR_MM = 12.0  # stands for "there is none" in distances between echoes
 FAR_DB = 40.0

@@ -10,7 +10,7 @@ import numpy as np
 from CranioNavLib.files import write_text
 from CranioNavLib.sequence_metafile import Recording
 
-from ModuleUltrasoundLib.measure import LineMeasurements
+from ModuleUltrasoundLib.measurement.measure import LineMeasurements
 
 COLUMNS = (
     "frame",

@@ -1,0 +1,1 @@
+"""From echoes to bone points: depth, covariance, quality, speed of sound."""
