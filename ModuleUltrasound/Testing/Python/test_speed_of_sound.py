@@ -7,7 +7,7 @@ from ModuleUltrasoundLib.measurement.measure import LineMeasurements
 from ModuleUltrasoundLib.measurement.speed_of_sound import estimate_if_pressed, estimate_speed
 
 
-def pressed(rng, true_speed, spots=8, frames=40, noise_mm=0.0, press_mm=2.0, slope=0.0, drift_mm=0.0):
+def pressed(rng, true_speed, spots=8, frames=40, noise_mm=0.0, press_mm=2.0, slope=0.0, drift_mm=0.0, echo_mm=0.01):
     """Lines of a probe that presses on flat bone at several spots; the depths as measured with 1540 m/s assumed."""
     poses, depths, points = [], [], []
     for spot in range(spots):
@@ -21,7 +21,7 @@ def pressed(rng, true_speed, spots=8, frames=40, noise_mm=0.0, press_mm=2.0, slo
         pose = frame @ local
         pose[:, :3, 3] += rng.normal(0, noise_mm, (frames, 3))
         poses.append(pose)
-        depths.append(thickness * 1540 / true_speed + rng.normal(0, 0.01, frames) * (noise_mm > 0))
+        depths.append(thickness * 1540 / true_speed + rng.normal(0, echo_mm, frames) * (noise_mm > 0))
         points.append(np.full(frames, spot))
     poses, depths = np.concatenate(poses), np.concatenate(depths)
     count = len(depths)
@@ -65,6 +65,18 @@ def test_stated_deviation_of_the_speed_matches_the_scatter():
         z.append((estimate.pressed_m_s - 1580) / estimate.pressed_sd_m_s)
     assert 0.6 < np.std(z) < 1.4  # that of 24 unit normals lies within 0.7 and 1.3 with 95 %
     assert abs(np.mean(z)) < 0.6
+
+
+@pytest.mark.parametrize(("noise_mm", "echo_mm"), [(0.03, 0.12), (0.08, 0.08), (0.12, 0.03)])
+def test_noise_of_neither_depth_nor_way_passes_for_slow_or_fast_tissue(noise_mm, echo_mm):
+    estimates = [
+        estimate_speed(*pressed(np.random.default_rng(seed), 1540.0, noise_mm=noise_mm, echo_mm=echo_mm, press_mm=0.9))
+        for seed in range(24)
+    ]
+    z = [(estimate.pressed_m_s - 1540) / estimate.pressed_sd_m_s for estimate in estimates]
+    assert abs(np.mean(z)) < 0.7
+    assert np.mean(np.abs(z) < 2) > 0.8
+    assert np.median([estimate.pressed_sd_m_s for estimate in estimates]) < 60
 
 
 def test_sliding_on_sloped_bone_while_pressing_is_not_taken_for_speed():
