@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib.util
 import io
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -162,22 +160,13 @@ def finish(user: Any, film: Film) -> None:
     film.take(3.0)
 
 
-def user_module() -> Any:
-    """The tests' user of the workstation."""
-    spec = importlib.util.spec_from_file_location("workstation_user", ROOT / "Testing" / "Python" / "workstation_user.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules["workstation_user"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def main() -> None:
     """Film, and say how long and how large it has become."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "pictures" / "workstation.webp")
     wanted = parser.parse_args()
-    users = user_module()
+    from Testing.Python import workstation_user as users
+
     with (
         tempfile.TemporaryDirectory() as scratch,
         users.served(Path(scratch) / "session") as (url, _),

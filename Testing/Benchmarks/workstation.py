@@ -11,7 +11,6 @@ Needs Chromium and the sample head. Everything tracked here is simulated.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import os
 import struct
 import subprocess
@@ -26,7 +25,6 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-USER = ROOT / "Testing" / "Python" / "workstation_user.py"
 STALL_S = 0.05  # shorter waits of the event loop are not looked at
 WATCH_PICTURES = """
 (() => {
@@ -56,16 +54,6 @@ WATCH_PICTURES = """
   };
 })();
 """
-
-
-def user_module() -> Any:
-    """The tests' user of the workstation."""
-    spec = importlib.util.spec_from_file_location("workstation_user", USER)
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules["workstation_user"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def run_stamped_server(arguments: list[str]) -> None:
@@ -155,11 +143,13 @@ def measure_start(runs: int) -> None:
     """From the command to a page that can be used, with the browser already open."""
     seconds, cpu = [], []
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # once set up, a program is not compiled anew at each start
-    with user_module().browsing() as user:
+    from Testing.Python import workstation_user
+
+    with workstation_user.browsing() as user:
         for _ in range(runs + 1):
             with tempfile.TemporaryDirectory() as scratch:
                 begun = time.monotonic()
-                with user_module().served(Path(scratch) / "session") as (url, process):
+                with workstation_user.served(Path(scratch) / "session") as (url, process):
                     user.open(url)
                     user.page.locator("[data-panel=ct] [data-action=layPatient]:not([disabled])").wait_for()
                     seconds.append(time.monotonic() - begun)
@@ -290,7 +280,9 @@ def wait_for_quiet(user: Any) -> None:
 @contextmanager
 def watched_browser() -> Iterator[Any]:
     """A user whose page notes its pictures."""
-    with user_module().browsing() as user:
+    from Testing.Python import workstation_user
+
+    with workstation_user.browsing() as user:
         user.page.add_init_script(WATCH_PICTURES)
         user.page.set_default_timeout(90_000)
         yield user

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 import signal
-import sys
 import urllib.error
 import urllib.request
 from pathlib import Path
 
 import pytest
 
-_SPEC = importlib.util.spec_from_file_location("workstation_user", Path(__file__).with_name("workstation_user.py"))
-assert _SPEC is not None
-assert _SPEC.loader is not None
-user_module = importlib.util.module_from_spec(_SPEC)
-sys.modules["workstation_user"] = user_module
-_SPEC.loader.exec_module(user_module)
+from Testing.Python import workstation_user as user_module
+
 browsing, served, User = user_module.browsing, user_module.served, user_module.User
 
 needs_browser = pytest.mark.skipif(not Path(user_module.BROWSER).exists(), reason="no Chromium on this machine")

@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
 
 import pytest
 
-if "workstation_user" not in sys.modules:
-    _SPEC = importlib.util.spec_from_file_location("workstation_user", Path(__file__).with_name("workstation_user.py"))
-    assert _SPEC is not None
-    assert _SPEC.loader is not None
-    sys.modules["workstation_user"] = importlib.util.module_from_spec(_SPEC)
-    _SPEC.loader.exec_module(sys.modules["workstation_user"])
-user_module = sys.modules["workstation_user"]
+from Testing.Python import workstation_user as user_module
 
 needs_browser = pytest.mark.skipif(not Path(user_module.BROWSER).exists(), reason="no Chromium on this machine")
 

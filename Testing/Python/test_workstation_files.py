@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import importlib.util
-import sys
 import urllib.error
 import urllib.request
 from collections.abc import AsyncIterator
@@ -15,6 +13,7 @@ from typing import Any
 import pytest
 from CranioNavLib.errors import InputError
 
+from Testing.Python import workstation_user as user_module
 from Workstation.web import session_files
 from Workstation.web.session_files import Places
 
@@ -113,18 +112,6 @@ def test_nothing_is_written_through_a_link(places, tmp_path):
     (tmp_path / "session" / "uploads" / "secret.nrrd").symlink_to(tmp_path / "elsewhere" / "secret.nrrd")
     send(places, "secret.nrrd", b"mine")
     assert (tmp_path / "elsewhere" / "secret.nrrd").read_bytes() == b"x"
-
-
-def _user_module() -> Any:
-    spec = importlib.util.spec_from_file_location("workstation_user", Path(__file__).with_name("workstation_user.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules["workstation_user"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-user_module = _user_module()
 
 
 def write_series(folder: Path, number: int, head: Any) -> None:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import importlib.util
 import io
 import json
 import re
-import sys
 import threading
 import time
 from pathlib import Path
@@ -17,15 +15,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from Testing.Python import workstation_user as user_module
 from Workstation.web.pictures import HEADER, MOST_ON_THEIR_WAY, PICTURES, Pictures, Viewer, encoded
 from Workstation.web.pictures_view import SCRIPT
-
-_SPEC = importlib.util.spec_from_file_location("workstation_user", Path(__file__).with_name("workstation_user.py"))
-assert _SPEC is not None
-assert _SPEC.loader is not None
-user_module: Any = importlib.util.module_from_spec(_SPEC)
-sys.modules["workstation_user"] = user_module
-_SPEC.loader.exec_module(user_module)
 
 
 class Socket:

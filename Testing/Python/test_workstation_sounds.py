@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,17 +10,11 @@ import numpy as np
 import pytest
 from ModuleUltrasoundLib.palpation.guidance import cue
 
+from Testing.Python import workstation_user as user_module
 from Workstation.web.sounds import Cues, Situation, TiltTone
 from Workstation.web.sounds_view import PLAY
 
-if "workstation_user" not in sys.modules:
-    _SPEC = importlib.util.spec_from_file_location("workstation_user", Path(__file__).with_name("workstation_user.py"))
-    assert _SPEC is not None
-    assert _SPEC.loader is not None
-    sys.modules["workstation_user"] = importlib.util.module_from_spec(_SPEC)
-    _SPEC.loader.exec_module(sys.modules["workstation_user"])
-BROWSER = sys.modules["workstation_user"].BROWSER
-needs_browser = pytest.mark.skipif(not Path(BROWSER).exists(), reason="no Chromium on this machine")
+needs_browser = pytest.mark.skipif(not Path(user_module.BROWSER).exists(), reason="no Chromium on this machine")
 
 
 def heard(*moments: Situation) -> list[str]:
@@ -81,7 +73,7 @@ def rendered():
       return Array.from((await context.startRendering()).getChannelData(0));
     }"""
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=BROWSER, args=sys.modules["workstation_user"].FLAGS.split())
+        browser = playwright.chromium.launch(executable_path=user_module.BROWSER, args=user_module.FLAGS.split())
         page = browser.new_page()
         page.evaluate(PLAY)
         yield lambda play, seconds=0.8: np.array(page.evaluate(script, [play, seconds, RATE_HZ]))

@@ -3,28 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-import importlib.util
 import signal
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from Testing.Python import workstation_cable as cable_module
+from Testing.Python import workstation_user as user_module
 from Workstation.web.session_windows import LOST_BYTES, STATE_TOPIC, Windows
 
-
-def _beside(name: str) -> Any:
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-user_module, cable_module = _beside("workstation_user"), _beside("workstation_cable")
 needs_browser = pytest.mark.skipif(not Path(user_module.BROWSER).exists(), reason="no Chromium on this machine")
 ASK_BEHIND_THE_PAGE = "trame.client.getConnection().getSession().call('trame.trigger', ['simulatedhand_run', ['layPatient'], {}])"
 
