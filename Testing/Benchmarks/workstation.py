@@ -98,9 +98,7 @@ def watch_loop() -> None:
     import asyncio
 
     run = asyncio.events.Handle._run
-    read_s = used = (
-        0.0  # the thread's processor time, and when it was read: to read it each time would take longer than much else
-    )
+    read_s = used = 0.0  # the thread's processor time, and when it was read: reading it each time would cost too much
 
     def timed(self: Any) -> None:
         nonlocal read_s, used

@@ -47,7 +47,7 @@ class Limits:
     """What is asked of a registration: its predicted 95% error at the worst target."""
 
     wanted_p95_mm: float = 2.0  # what the next points are planned for
-    warn_p95_mm: float = 2.5  # then 3 mm, where a registration has failed, are passed about once in a hundred times
+    warn_p95_mm: float = 2.5  # 3 mm are a failure: the 99% limit of an error that is alike in all directions
     refuse_p95_mm: float = 6.0
 
 
