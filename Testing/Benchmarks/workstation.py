@@ -3,8 +3,8 @@
     python Testing/Benchmarks/workstation.py [start] [ct] [latency] [memory] [--minutes 10] [--runs 5] [--rate 60]
 
 Each picture that the server sends carries the time at which the pose that it shows was taken (8 bytes behind the JPEG, which
-decoders leave alone), and the page notes when the frame is done in which it was drawn. Server and browser share one computer
-and its clock.
+decoders leave alone), and the page's worker notes when the frame is done in which it was drawn. Server and browser share one
+computer and its clock.
 Needs Chromium and the sample head. Everything tracked here is simulated.
 """
 
@@ -28,28 +28,36 @@ ROOT = Path(__file__).resolve().parents[2]
 STALL_S = 0.05  # shorter waits of the event loop are not looked at
 WATCH_PICTURES = """
 (() => {
-  const stamps = new Map(), utf8 = new TextDecoder();
+  const inside = `
+    const stamps = new Map(), names = new TextDecoder(), seen = new BroadcastChannel('seen-pictures');
+    self.WebSocket = class extends self.WebSocket {
+      constructor(address, ...rest) {
+        super(address, ...rest);
+        this.addEventListener('message', ({ data }) => {
+          if (typeof data === 'string') return;
+          const view = new DataView(data), area = names.decode(new Uint8Array(data, 5, view.getUint8(4)));
+          stamps.set(JSON.stringify([area, view.getUint32(0, true)]), view.getFloat64(data.byteLength - 8, true));
+          if (stamps.size > 400) stamps.delete(stamps.keys().next().value);
+        });
+      }
+      send(message) {
+        super.send(message);
+        const [area] = JSON.parse(message), { width, height } = canvases.get(area);
+        requestAnimationFrame(() => {  // it was drawn within a frame: when the next one begins, that one is done
+          const shown = (performance.timeOrigin + performance.now()) / 1000;
+          seen.postMessage([area, stamps.get(message), shown, width * height]);
+        });
+      }
+    };
+  `;
   window.seenPictures = [];
-  window.WebSocket = class extends window.WebSocket {
-    constructor(address, ...rest) {
-      super(address, ...rest);
-      this.pictures = String(address).endsWith('/pictures');
-      if (this.pictures) this.addEventListener('message', ({ data }) => {
-        if (typeof data === 'string') return;
-        const view = new DataView(data), area = utf8.decode(new Uint8Array(data, 5, view.getUint8(4)));
-        stamps.set(JSON.stringify([area, view.getUint32(0, true)]), view.getFloat64(data.byteLength - 8, true));
-        if (stamps.size > 400) stamps.delete(stamps.keys().next().value);
-      });
-    }
-    send(message) {
-      super.send(message);
-      if (!this.pictures) return;
-      const [area] = JSON.parse(message), canvases = [...document.querySelectorAll('canvas[data-picture]')];
-      const view = canvases.findIndex((one) => one.dataset.picture === area), { width, height } = canvases[view];
-      requestAnimationFrame(() => {  // it was drawn within a frame: when the next one begins, that one is done
-        const shown = (performance.timeOrigin + performance.now()) / 1000;
-        window.seenPictures.push([view, stamps.get(message), shown, width * height]);
-      });
+  new BroadcastChannel('seen-pictures').onmessage = ({ data: [area, ...seen] }) => {
+    const canvases = [...document.querySelectorAll('canvas[data-picture]')];
+    window.seenPictures.push([canvases.findIndex((one) => one.dataset.picture === area), ...seen]);
+  };
+  window.Blob = class extends window.Blob {  // the worker that draws begins with what notes it
+    constructor(parts, options) {
+      super(options && options.type === 'text/javascript' ? [inside, ...parts] : parts, options);
     }
   };
 })();

@@ -178,7 +178,11 @@ class Room:
 
 @pytest.mark.skipif(not Path(user_module.BROWSER).exists(), reason="no Chromium on this machine")
 def test_a_view_says_that_its_picture_is_old_and_no_longer_when_it_is_not():
-    grey = "() => document.querySelector('canvas').getContext('2d').getImageData(30, 20, 1, 1).data[0]"
+    grey = """() => {
+      const copy = new OffscreenCanvas(60, 40).getContext('2d');
+      copy.drawImage(document.querySelector('canvas'), 0, 0);
+      return copy.getImageData(30, 20, 1, 1).data[0];
+    }"""
     with Room() as room, user_module.browsing() as user:
         page, sign = user.page, user.page.locator("[data-behind]")
         page.goto(room.url)

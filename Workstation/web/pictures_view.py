@@ -1,6 +1,11 @@
-"""The page's side of the views' pictures: draws them, says so, and says over a view that its picture is old."""
+"""The page's side of the views' pictures: draws them, says so, and says over a view that its picture is old.
+
+A worker takes the pictures from the wire, decodes and draws them, so that a page that is busy with its panels holds up none.
+"""
 
 from __future__ import annotations
+
+import json
 
 from trame.widgets import client, html
 
@@ -14,70 +19,96 @@ STYLE = """
   padding: 4px 14px; font-size: 22px; font-weight: 700; background: #f0b429; color: #16130a; border-radius: 4px; }
 """
 
-# Decoding is the browser's own, off the page's thread; drawing and saying so come once a frame, so that a page that cannot
-# keep up is sent less. A view that is not on the page keeps its last picture until it is.
+# What it drew it says once a frame, so that a window that cannot keep up is sent less. A view that is not on the page keeps
+# its last picture until it is; another layout makes new canvases, which show the last picture until theirs comes.
+WORKER = f"""
+const canvases = new Map(), decoded = new Map(), latest = new Map(), last = new Map(), utf8 = new TextDecoder();
+let address = '', socket = null, frame = 0;
+
+const paint = (canvas, picture) => {{
+  const width = picture.displayWidth || picture.width, height = picture.displayHeight || picture.height;
+  if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, {{ width, height }});
+  canvas.getContext('2d', {{ alpha: false }}).drawImage(picture, 0, 0);
+}};
+const draw = () => {{
+  frame = 0;
+  for (const [area, [number, picture]] of decoded) {{
+    const canvas = canvases.get(area);
+    if (!canvas) continue;
+    paint(canvas, picture);
+    if (last.has(area)) last.get(area).close();
+    last.set(area, picture);
+    decoded.delete(area);
+    if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify([area, number]));
+  }}
+}};
+const decode = async (content) => {{
+  if (!self.ImageDecoder) return createImageBitmap(new Blob([content], {{ type: 'image/jpeg' }}));
+  const decoder = new ImageDecoder({{ data: content, type: 'image/jpeg' }});
+  const {{ image }} = await decoder.decode();
+  decoder.close();
+  return image;
+}};
+const show = async (data) => {{
+  const head = new DataView(data), number = head.getUint32(0, true), length = head.getUint8(4);
+  const area = utf8.decode(new Uint8Array(data, {HEADER.size}, length));
+  const picture = await decode(new Uint8Array(data, {HEADER.size} + length));
+  if (number <= latest.get(area)) return picture.close();
+  latest.set(area, number);
+  if (decoded.has(area)) decoded.get(area)[1].close();
+  decoded.set(area, [number, picture]);
+  frame = frame || requestAnimationFrame(draw);
+}};
+const connect = () => {{
+  socket = new WebSocket(address);
+  socket.binaryType = 'arraybuffer';
+  latest.clear();
+  socket.onmessage = ({{ data }}) => {{
+    if (typeof data === 'string') self.postMessage(JSON.parse(data)); else show(data);
+  }};
+  socket.onclose = () => setTimeout(connect, 1000);
+}};
+self.onmessage = ({{ data }}) => {{
+  if (data.address) {{
+    address = data.address;
+    return connect();
+  }}
+  if (!data.canvas) return canvases.delete(data.area);
+  canvases.set(data.area, data.canvas);
+  if (last.has(data.area)) paint(data.canvas, last.get(data.area));
+  if (decoded.has(data.area)) frame = frame || requestAnimationFrame(draw);
+}};
+"""
 SCRIPT = f"""
 (() => {{
   if (window.cranionavPictures) return;
-  window.cranionavPictures = true;
-  const address = new URL('{PICTURES}', window.location.href), words = {words.PICTURE_OLD!r};
+  const source = new Blob([{json.dumps(WORKER)}], {{ type: 'text/javascript' }});
+  const worker = window.cranionavPictures = new Worker(URL.createObjectURL(source));
+  const address = new URL('{PICTURES}', window.location.href), words = {words.PICTURE_OLD!r}, given = new Map();
+  let told = {{}}, heard = performance.now();
   address.protocol = address.protocol.replace('http', 'ws');
-  const decoded = new Map(), latest = new Map(), shown = new Map(), utf8 = new TextDecoder();
-  let socket = null, told = {{}}, heard = performance.now(), frame = 0;
 
-  const draw = () => {{
-    frame = 0;
-    for (const [area, [number, picture]] of decoded) {{
-      const canvas = document.querySelector(`canvas[data-picture="${{area}}"]`);
-      if (!canvas) continue;
-      const width = picture.displayWidth || picture.width, height = picture.displayHeight || picture.height;
-      if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, {{ width, height }});
-      canvas.getContext('2d', {{ alpha: false }}).drawImage(picture, 0, 0);
-      shown.set(area, canvas);
-      picture.close();
-      decoded.delete(area);
-      if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify([area, number]));
-    }}
+  worker.onmessage = ({{ data }}) => {{
+    heard = performance.now();
+    told = data;
   }};
-  const decode = async (content) => {{
-    if (!window.ImageDecoder) return createImageBitmap(new Blob([content], {{ type: 'image/jpeg' }}));
-    const decoder = new ImageDecoder({{ data: content, type: 'image/jpeg' }});
-    const {{ image }} = await decoder.decode();
-    decoder.close();
-    return image;
-  }};
-  const show = async (data) => {{
-    const head = new DataView(data), number = head.getUint32(0, true), length = head.getUint8(4);
-    const area = utf8.decode(new Uint8Array(data, {HEADER.size}, length));
-    const picture = await decode(new Uint8Array(data, {HEADER.size} + length));
-    if (number <= latest.get(area)) return;
-    latest.set(area, number);
-    if (decoded.has(area)) decoded.get(area)[1].close();
-    decoded.set(area, [number, picture]);
-    frame = frame || requestAnimationFrame(draw);
-  }};
-  const connect = () => {{
-    socket = new WebSocket(address);
-    socket.binaryType = 'arraybuffer';
-    latest.clear();
-    socket.onmessage = ({{ data }}) => {{
-      heard = performance.now();
-      if (typeof data === 'string') told = JSON.parse(data); else show(data);
-    }};
-    socket.onclose = () => setTimeout(connect, 1000);
-  }};
-  const keep = () => {{  // another layout makes new canvases: they show the last picture until theirs comes
+  worker.postMessage({{ address: address.href }});
+  const give = () => {{
     for (const canvas of document.querySelectorAll('canvas[data-picture]')) {{
-      const area = canvas.dataset.picture, before = shown.get(area);
-      if (!before || before === canvas) continue;
-      Object.assign(canvas, {{ width: before.width, height: before.height }});
-      canvas.getContext('2d', {{ alpha: false }}).drawImage(before, 0, 0);
-      shown.set(area, canvas);
+      const area = canvas.dataset.picture;
+      if (given.get(area) === canvas) continue;
+      const offscreen = canvas.transferControlToOffscreen();
+      given.set(area, canvas);
+      worker.postMessage({{ area, canvas: offscreen }}, [offscreen]);
+    }}
+    for (const [area, canvas] of given) {{
+      if (canvas.isConnected) continue;
+      given.delete(area);
+      worker.postMessage({{ area }});
     }}
   }};
   const say = () => {{
-    keep();
-    if (decoded.size && !frame) frame = requestAnimationFrame(draw);
+    give();
     const quiet = (performance.now() - heard) / 1000;
     for (const sign of document.querySelectorAll('[data-behind]')) {{
       const behind = (told[sign.dataset.behind] || 0) + ((told[sign.dataset.behind] || quiet > {OLD_S}) ? quiet : 0);
@@ -88,7 +119,6 @@ SCRIPT = f"""
       }}
     }}
   }};
-  connect();
   setInterval(say, 100);
 }})();
 """
