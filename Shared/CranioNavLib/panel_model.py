@@ -87,8 +87,15 @@ class PanelModel:
         return getattr(self._parameters().read(), field.name)
 
     def change(self, field: Field, value: Any) -> bool:
-        """Store an edit; False, with `errors[field.name]` set, if it is refused."""
-        return self._store(field.name, self._parameters(), field.name, value)
+        """Store an edit; False, with `errors[field.name]` set, if it is refused. The logic may hear of it: `<name>Changed`."""
+        before = self.value(field)
+        if not self._store(field.name, self._parameters(), field.name, value):
+            return False
+        companion = getattr(self.logic, f"{field.name}Changed", None)
+        if companion is not None and self.value(field) != before:
+            companion()
+            self.notify()
+        return True
 
     def choices(self, field: PluginField) -> list[str]:
         """Names of the plugins that can be chosen."""

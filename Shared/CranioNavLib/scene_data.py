@@ -161,6 +161,7 @@ def set_volume(role: str, volume: Volume) -> Any:
     """Set the voxels and the place of a role's volume; returns the node."""
     host.check_thread()
     node, util = scene.find_or_create(role), host.slicer_package().util
+    node.SetAndObserveImageData(None)  # another image, not other voxels in it: who keeps something of an image tells by that
     node.SetIJKToRASMatrix(util.vtkMatrixFromArray(volume.ijk_to_ras))
     node.CreateDefaultDisplayNodes()
     display = node.GetDisplayNode()

@@ -33,7 +33,7 @@ def test_the_hand_glides_to_and_fro_while_a_sweep_is_recorded_and_no_longer(a_se
     node = scene_data.set_points("ProtocolPoints", LabelledPoints(("1", "2", "3"), bone.vertices_mm[high]))
     for axis, name in enumerate(("Normal_R", "Normal_A", "Normal_S")):
         scene_data.add_measurement(node, name, bone.vertex_normals[high, axis])
-    hand = SimulatedHandLogic(lambda: None, lambda: 0 if recording[0] else None, lambda: recording[0])
+    hand = SimulatedHandLogic(lambda: None, lambda: 0 if recording[0] else None, lambda: recording[0], lambda volume: None)
     assert "glide" in hand.palpationHandStatus().text
     assert "to and fro" in hand.palpateAll().run()
     assert hand.palpationHandStatus().state is StepState.DONE

@@ -12,8 +12,10 @@ import pytest
 from CranioNavLib import host, scene_data
 from CranioNavLib.errors import InputError
 from CranioNavLib.files import set_aside
+from CranioNavLib.panel import StepState
 from CranioNavLib.panel_model import PanelModel
 from CranioNavLib.slicer_files import LabelledPoints
+from CranioNavLib.volume import Volume
 
 from Workstation.web.session_folder import SessionFolder
 
@@ -40,9 +42,12 @@ class Workstation:
     def go_to(self, step: str) -> None:
         self.step = step
 
+    def action(self, module: str, name: str) -> Any:
+        return next(one for one in self.models[module].panel.actions() if one.name == name)
+
     def do(self, module: str, action: str) -> str:
         model = self.models[module]
-        assert model.run(next(one for one in model.panel.actions() if one.name == action)), model.message.text
+        assert model.run(self.action(module, action)), model.message.text
         return model.message.text
 
     def keep(self) -> None:
@@ -161,8 +166,6 @@ def test_a_damaged_session_is_refused_and_nothing_is_changed(tmp_path):
 
 
 def test_what_was_verified_is_kept(tmp_path):
-    from CranioNavLib.volume import Volume
-
     running = Workstation(tmp_path)
     scene_data.set_volume("CT", Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), "nothing"))
     scene_data.set_transform("ReferenceToRas", np.eye(4)).SetAttribute("CranioNav.Status", "accepted")
@@ -172,6 +175,69 @@ def test_what_was_verified_is_kept(tmp_path):
     state = json.loads((tmp_path / "session.json").read_text())
     assert state["tables"]["TargetErrors"] == {"target": ["a"], "TRE (mm)": [1.5]}
     assert state["registered_points"] == {"labels": ["p"], "positions_mm": [[1.0, 2.0, 3.0]]}
+
+
+def test_a_second_ct_takes_the_place_of_the_first_in_the_folder(tmp_path):
+    import SimpleITK
+
+    running = Workstation(tmp_path)
+    volumes = [Volume(np.full((4, 5, 6), value, np.int16), np.eye(4), "CT") for value in (1, 2, 3)]
+    running.logics["ModuleRegistration"].takeCt(volumes[0])
+    running.keep()
+    assert (tmp_path / "session.json").is_file()
+    pending = []
+    for volume in volumes[1:]:
+        running.logics["ModuleRegistration"].takeCt(volume)
+        pending.append(running.session.ct_to_write())
+        running.session.save("ct")
+    for volume in reversed(pending):  # two workers: the last that ends need not be the last that began
+        running.session.write_ct(volume)
+        assert not (tmp_path / "session.json").exists(), "a state beside a CT that it is not of"
+    assert SimpleITK.GetArrayFromImage(SimpleITK.ReadImage(tmp_path / "ct.nrrd")).max() == 3
+    running.keep()
+    assert (tmp_path / "session.json").is_file()
+
+
+def test_of_a_patient_laid_on_the_table_before_nothing_stays(tmp_path):
+    from types import SimpleNamespace
+
+    from CranioNavLib import scene
+    from CranioNavLib.phantom.session import use_session
+
+    running = Workstation(tmp_path)
+    hand = running.logics["SimulatedHand"]
+    places = np.array([[0.0, 90, 0], [50, 60, 10], [-50, 60, 12]])
+    laid = SimpleNamespace(landmark_labels=("a", "b", "c"), landmarks_ras_mm=places, markers_ras_mm=places)
+    volume = Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), "nothing")
+    hand._take(SimpleNamespace(patient=laid), volume, "one")
+    for role in ("LandmarksPatient", "SurfacePoints", "TargetsPatient", "ProtocolPoints", "RegisteredPoints"):
+        scene_data.set_points(role, LabelledPoints(("a", "b", "c"), places))
+    scene_data.set_transform("ReferenceToRas", np.diag([-1.0, -1.0, 1.0, 1.0])).SetAttribute("CranioNav.Status", "accepted")
+    scene_data.set_table("Results", {"quantity": ["verdict"], "value": ["accepted"]})
+    (tmp_path / "palpation.igs.mha").write_text("of the one before")
+    hand._take(SimpleNamespace(patient=laid), volume, "another")
+    use_session(None)
+    for role in ("LandmarksPatient", "SurfacePoints", "TargetsPatient", "ProtocolPoints", "RegisteredPoints", "Results"):
+        assert scene.find(role) is None, role
+    assert running.logics["Navigation"].navigationStatus().state is StepState.TODO
+    assert running.models["ModuleUltrasound"].blocked(running.action("ModuleUltrasound", "measureRecording"))
+    assert (tmp_path / "palpation-1.igs.mha").is_file(), "set aside, not lost"
+
+
+def test_a_report_of_another_registration_is_none_of_this_one_after_a_restart_either(tmp_path):
+    running = Workstation(tmp_path)
+    scene_data.set_volume("CT", Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), "nothing"))
+    node = scene_data.set_transform("ReferenceToRas", np.eye(4))
+    node.SetAttribute("CranioNav.Status", "accepted")
+    running.logics["Session"]._report_written(0.0)
+    for turned, state in ((np.eye(4), StepState.DONE), (np.diag([-1.0, -1.0, 1.0, 1.0]), StepState.ATTENTION)):
+        scene_data.set_transform("ReferenceToRas", turned)
+        running.keep()
+        again = Workstation(tmp_path)
+        again.session.restore_registration(again.session.read_state(tmp_path))
+        assert again.logics["Session"].reportStatus().state is state
+        running = again
+        scene_data.set_volume("CT", Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), "nothing"))
 
 
 def test_a_report_that_is_cancelled_is_written_no_further(tmp_path):

@@ -12,6 +12,7 @@ from typing import Any
 
 from CranioNavLib import host, scene
 from CranioNavLib.errors import InputError
+from CranioNavLib.files import set_aside
 from CranioNavLib.panel import Panel
 from CranioNavLib.panel_model import PanelModel
 from trame.app import TrameApp
@@ -337,15 +338,25 @@ def _modules(session: SessionFolder, logics: dict[str, Any], go_to: Any) -> list
     from ModuleUltrasound import ModuleUltrasoundLogic
     from Workstation.web import navigation, session_panel, simulated_hand
 
-    ultrasound = ModuleUltrasoundLogic()
+    registration, tracking, ultrasound = ModuleRegistrationLogic(), ModuleTrackingLogic(), ModuleUltrasoundLogic()
+
+    def take_patient(volume: Any) -> None:
+        for device in (tracking, ultrasound):  # the simulated ones look at the patient who was there when they were connected
+            if device.stream is not None:
+                device.disconnect()
+        registration.forgetPatient()
+        registration.takeCt(volume)
+        set_aside(ultrasound.parameters().read().recording_path or session.recording_path)
+
     hand = simulated_hand.SimulatedHandLogic(
         ultrasound.nextPoint,
         lambda: len(ultrasound.taken()) if ultrasound.recorded() else None,
         lambda: ultrasound.sweep is not None,
+        take_patient,
     )
     return [
-        (REGISTRATION_PANEL, ModuleRegistrationLogic()),
-        (TRACKING_PANEL, ModuleTrackingLogic()),
+        (REGISTRATION_PANEL, registration),
+        (TRACKING_PANEL, tracking),
         (ULTRASOUND_PANEL, ultrasound),
         (simulated_hand.PANEL, hand),
         (navigation.PANEL, navigation.NavigationLogic()),

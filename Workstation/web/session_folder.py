@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -54,10 +55,11 @@ class SessionFolder:
     def __init__(self, folder: Path, parameter_nodes: Callable[[], Iterable[Any]]) -> None:
         self.folder, self._parameter_nodes = Path(folder), parameter_nodes
         self.simulated_seed: int | None = None
-        self.reported = False  # whether the report in the folder is of the registration in force
+        self.report_of = ""  # the registration that the report in the folder is of
         self._written: dict[str, str] = {}
-        self._ct_image: Any = None
-        self._ct_pending = False  # the CT is not in the folder yet: nothing to go on from
+        self._ct_image: Any = None  # of the CT that is, or is being, written
+        self._ct_pending: Any = None  # the CT (Volume) that is not in the folder yet: nothing to go on from
+        self._ct_lock = threading.Lock()  # one is written at a time
         self._state = ""
 
     @property
@@ -70,35 +72,40 @@ class SessionFolder:
         node = scene.find("CT")
         if node is None or node.GetImageData() is None or node.GetImageData() is self._ct_image:
             return None
-        self._ct_image, self._ct_pending = node.GetImageData(), True
-        return scene_data.get_volume("CT")
+        self._ct_image, self._ct_pending, self._state = node.GetImageData(), scene_data.get_volume("CT"), ""
+        return self._ct_pending
 
     def write_ct(self, volume: Any) -> None:
-        """Put the CT into the folder."""
+        """Put the CT into the folder, unless another one has come since. The state of the one before goes first."""
         from CranioNavLib.phantom.case_writer import write_volume
 
-        write_volume(output_folder(self.folder) / "ct.nrrd", volume)
-        self._ct_pending = False
+        with self._ct_lock:
+            if volume is not self._ct_pending:
+                return
+            (self.folder / STATE_FILE).unlink(missing_ok=True)
+            write_volume(output_folder(self.folder) / "ct.nrrd", volume)
+            if volume is self._ct_pending:
+                self._ct_pending = None
 
     def save(self, step: str) -> None:
-        """Write the lists and the state, where they changed. Main thread only."""
-        for role, name in LISTS.items():
-            self._save_list(role, output_folder(self.folder) / name if scene.find("CT") is not None else None)
-        if scene.find("CT") is None or self._ct_pending:
+        """Write the lists and the state, where they changed, once the CT that they are of is written. Main thread only."""
+        if scene.find("CT") is None or self._ct_pending is not None:
             return
+        for role, name in LISTS.items():
+            self._save_list(role, output_folder(self.folder) / name)
         state = json.dumps(self._collect(step), indent=1)
         if state != self._state:
             write_text(self.folder / STATE_FILE, state + "\n")
             self._state = state
 
-    def _save_list(self, role: str, path: Path | None) -> None:
+    def _save_list(self, role: str, path: Path) -> None:
         node = scene.find(role)
         empty = node is None or not node.GetNumberOfControlPoints()
         points = None if empty else scene_data.get_points(role)
         content = (
             "" if points is None else f"{points.labels}{points.positions_mm.tobytes().hex()}"
         )  # a new point leaves MTime alone
-        if path is None or self._written.get(role, "") == content:
+        if self._written.get(role, "") == content:
             return
         self._written[role] = content
         if points is None:
@@ -118,7 +125,7 @@ class SessionFolder:
             "asked_for": self._asked_for(),
             "tables": {role: scene_data.get_table(role) for role in TABLES if scene.find(role) is not None},
             "registered_points": self._registered_points(),
-            "reported": self.reported,
+            "report_of": self.report_of,
             "parameters": {
                 node.GetName(): {name: node.GetParameter(name) for name in node.GetParameterNames()}
                 for node in self._parameter_nodes()
@@ -193,4 +200,4 @@ class SessionFolder:
         points = state.get("registered_points")
         if points:
             scene_data.set_points("RegisteredPoints", LabelledPoints(tuple(points["labels"]), np.array(points["positions_mm"])))
-        self.reported = bool(state.get("reported"))
+        self.report_of = str(state.get("report_of") or "")

@@ -71,7 +71,6 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         super().__init__()
         self.session, self._logics, self._go_to = session, logics, go_to
         self._resumable = last_session(session.folder)
-        self._report_of = ""  # the registration that the report shows
 
     # Going on
 
@@ -139,8 +138,6 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         if take is not None:
             take()
         self.session.restore_registration(state)
-        if self.session.reported:
-            self._report_of = json.dumps(scene_data.get_transform("ReferenceToRas").tolist())
         self._go_to(state["step"])
         return "the session goes on where it was; connect the devices again"
 
@@ -178,8 +175,7 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         return "" if (self.session.folder / "ct.nrrd").is_file() else "the CT is still being saved"
 
     def _report_written(self, difference_mm: float) -> str | Reading:
-        self._report_of = json.dumps(scene_data.get_transform("ReferenceToRas").tolist())
-        self.session.reported = True
+        self.session.report_of = json.dumps(scene_data.get_transform("ReferenceToRas").tolist())
         if difference_mm > SAME_MM:
             said = (
                 f"written; its registration lies up to {difference_mm:.2f} mm from the one on the screen: {self._why_different()}"
@@ -219,13 +215,13 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
     def offered(self) -> list[str]:
         """Files of the session that the page may open, once they are of this registration."""
-        return [name for name in OFFERED if (self.session.folder / name).is_file()] if self._report_of else []
+        return [name for name in OFFERED if (self.session.folder / name).is_file()] if self.session.report_of else []
 
     def reportStatus(self) -> StepStatus:
         """Whether the report is of the registration in force."""
-        if not self._report_of:
+        if not self.session.report_of:
             return StepStatus(StepState.TODO, self.writeReportBlocked() or "write the report")
-        if self._report_of != json.dumps(scene_data.get_transform("ReferenceToRas").tolist()):
+        if self.session.report_of != json.dumps(scene_data.get_transform("ReferenceToRas").tolist()):
             return StepStatus(StepState.ATTENTION, "the registration has changed; write the report again")
         return StepStatus(StepState.DONE)
 

@@ -16,6 +16,7 @@ from CranioNavLib.parameters import Limits, Parameters
 from CranioNavLib.phantom.constants import MOVE_S
 from CranioNavLib.scripted_module import ScriptedLoadableModuleLogic
 from CranioNavLib.slicer_files import LabelledPoints
+from CranioNavLib.volume import Volume
 
 PATIENCE = 4.0  # dwell times on one point before it is left out
 
@@ -100,9 +101,16 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
     parameterClass = HandParameters
     sessionRole = "SimulationSession"
 
-    def __init__(self, skip: Callable[[], object], taken: Callable[[], int | None], sweeping: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        skip: Callable[[], object],
+        taken: Callable[[], int | None],
+        sweeping: Callable[[], bool],
+        take_patient: Callable[[Volume], object],
+    ) -> None:
         super().__init__()
         self.skip, self.taken = skip, taken  # go on to the next point; how many are taken; None: not recording
+        self.take_patient = take_patient  # make the CT of another patient the scene's; nothing of the one before stays
         self.sweeping = sweeping  # whether what is recorded is a sweep
         self._visit: Visit | None = None
         self._glides_until_s = 0.0
@@ -121,14 +129,17 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
         return Task("Use the simulated patient", make, lambda made: self._take(*made))
 
+    def layPatientBlocked(self) -> str:
+        """Why no other patient can be laid on the table now."""
+        return "stop the recording first" if self.taken() is not None or self.sweeping() else ""
+
     def _take(self, session: Any, volume: Any, head: str) -> str:
         from CranioNavLib.phantom.session import use_session
 
+        self.take_patient(volume)
+        self._visit, self._glides_until_s, self._does = None, 0.0, ("", "", 0.0)
         use_session(session)
         patient = session.patient
-        for role in ("Bone", "OuterTable", "Skin", "LandmarksPatient", "SurfacePoints", "TargetsPatient", "PlausibilityPoints"):
-            scene.release(role)
-        scene_data.set_volume("CT", volume)
         scene_data.set_points("LandmarksCT", LabelledPoints(patient.landmark_labels, patient.landmarks_ras_mm))
         targets = tuple(f"Target {number + 1}" for number in range(len(patient.markers_ras_mm)))
         scene_data.set_points("TargetsCT", LabelledPoints(targets, patient.markers_ras_mm))

@@ -11,7 +11,7 @@ from CranioNavLib.panel import Progress, StepStatus, Task
 from CranioNavLib.slicer_files import LabelledPoints
 from CranioNavLib.surface import Surface
 
-from ModuleRegistrationLib.logic.given import OFFSET_SD, POSITION_SD, THRESHOLD, RegistrationStep, lacking_ct
+from ModuleRegistrationLib.logic.given import OFFSET_SD, POSITION_SD, THRESHOLD, RegistrationStep, lacking_ct, of_this_ct
 
 if TYPE_CHECKING:
     from ModuleRegistrationLib.anatomy.segmentation import BoneSurfaces
@@ -36,7 +36,7 @@ class BoneStep(RegistrationStep):
             progress("preparing its surface for what comes", 0.8)
             return prepared(found)
 
-        return Task("Find bone", segment, self.takeBone)
+        return Task("Find bone", segment, of_this_ct(self.takeBone))
 
     def segmentBoneBlocked(self) -> str:
         """Why bone cannot be segmented now."""
@@ -69,7 +69,7 @@ class BoneStep(RegistrationStep):
             scene_data.set_points("TargetsCT", LabelledPoints(labels, found.centers_ras_mm))
             return f"{len(found)} spheres found"
 
-        return Task("Find spheres", search, take)
+        return Task("Find spheres", search, of_this_ct(take))
 
     def findMarkersBlocked(self) -> str:
         """Why markers cannot be searched now."""
@@ -89,7 +89,7 @@ class BoneStep(RegistrationStep):
             scene_data.set_surface("Skin", skin)
             return f"skin: {len(skin.triangles)} triangles"
 
-        return Task("Find skin", find, take)
+        return Task("Find skin", find, of_this_ct(take))
 
     def findSkinBlocked(self) -> str:
         """Why the skin cannot be searched now."""

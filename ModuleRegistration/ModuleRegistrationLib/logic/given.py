@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Optional
+from collections.abc import Callable
+from typing import Any, Optional, TypeVar
 
 from CranioNavLib import scene, scene_data
 from CranioNavLib.errors import InputError
@@ -27,6 +28,9 @@ WORDS = {  # for what is missing
 }
 
 
+T = TypeVar("T")
+
+
 class RegistrationStep(ParametersInScene[RegistrationParameters]):
     """What every step of the panel stands on."""
 
@@ -43,6 +47,34 @@ def lacking(*roles: str) -> str:
 def lacking_ct() -> str:
     """What to do before anything can be done with the CT; "" if it is there."""
     return "" if scene.find("CT") is not None else "load a CT first"
+
+
+def of_this_ct(take: Callable[..., T]) -> Callable[..., T]:
+    """`take`, which brings into the scene what is computed from it now, refused where another CT has come meanwhile.
+
+    Raises
+    ------
+    InputError
+        By what is returned: it would be of the CT before.
+    """
+    before = _image()
+
+    def take_if_same(*found: Any) -> T:
+        if _image() is not before:
+            raise InputError("another CT has been loaded meanwhile; what was found in the one before is dropped: press it again")
+        return take(*found)
+
+    return take_if_same
+
+
+def _image() -> Any:
+    node = scene.find("CT")
+    return node.GetImageData() if node is not None else None
+
+
+def filled(*roles: str) -> list[str]:
+    """What these nodes hold, in words; those that are missing or empty are left out."""
+    return list(dict.fromkeys(WORDS[role] for role in roles if _has_content(scene.find(role))))
 
 
 def pairs(patient_role: str, ct_role: str) -> tuple[Array, Array, tuple[str, ...]]:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Union
+
 from CranioNavLib import scene, scene_data
 from CranioNavLib.bone_points import BonePoints
 from CranioNavLib.case import Case, read_case
 from CranioNavLib.module_logic import done_or
-from CranioNavLib.panel import Progress, StepStatus, Task
+from CranioNavLib.panel import Level, Progress, Reading, StepStatus, Task
 from CranioNavLib.volume import Volume
 
-from ModuleRegistrationLib.logic.given import RegistrationStep
+from ModuleRegistrationLib.logic.given import RegistrationStep, filled
 from ModuleRegistrationLib.logic.results import forget_registration
+
+OF_THE_PATIENT = ("LandmarksPatient", "SurfacePoints", "TargetsPatient", "PlausibilityPoints")  # a new CT of him leaves them
 
 
 class LoadingStep(RegistrationStep):
@@ -32,14 +36,28 @@ class LoadingStep(RegistrationStep):
         """Why no CT can be loaded now."""
         return "" if self.parameters().read().ct_path else "choose a DICOM folder or an image file first"
 
-    def takeCt(self, volume: Volume) -> str:
-        """Make a CT the scene's; what was found in another one, and its registration, go."""
-        found = ("Bone", "OuterTable", "Skin", "LandmarksCT", "TargetsCT")
+    def ct_pathChanged(self) -> None:
+        """Another path was given: the series chosen of the one before is none of it."""
+        self.parameters().change(ct_series="")
+
+    def takeCt(self, volume: Volume) -> Union[str, Reading]:
+        """Make a CT the scene's; what was found in another one, and its registration, go. Returns a message, a warning if what
+        was touched on the patient stays."""
+        kept = filled(*OF_THE_PATIENT) if scene.find("CT") is not None else []
+        found = ("Bone", "OuterTable", "Skin", "LandmarksCT", "TargetsCT", "ProtocolPoints")
         for role in (*found, "RegisteredPoints", "Results", "Residuals", "TargetErrors"):
             scene.release(role)
         forget_registration()
         scene_data.set_volume("CT", volume)
-        return f"{volume.description}: {' × '.join(str(size) for size in volume.hu.shape[::-1])} voxels"
+        said = f"{volume.description}: {' × '.join(str(size) for size in volume.hu.shape[::-1])} voxels"
+        if not kept:
+            return said
+        return Reading(f"{said}; kept from before: {', '.join(kept)}. For another patient begin a new session", Level.WARNING)
+
+    def forgetPatient(self) -> None:
+        """Another patient: what was touched on the one before goes."""
+        for role in OF_THE_PATIENT:
+            scene.release(role)
 
     def loadCase(self) -> Task:
         """Read a case folder: CT, landmarks, targets, plausibility points, and its bone points by mode."""

@@ -17,7 +17,7 @@ from CranioNavLib.slicer_files import LabelledPoints
 from CranioNavLib.volume import Volume
 
 from ModuleRegistrationLib.anatomy.landmark_suggestions import LABELS
-from ModuleRegistrationLib.logic.given import OFFSET_SD, POSITION_SD, THRESHOLD, RegistrationStep, lacking, lacking_ct
+from ModuleRegistrationLib.logic.given import OFFSET_SD, POSITION_SD, THRESHOLD, RegistrationStep, lacking, lacking_ct, of_this_ct
 
 if TYPE_CHECKING:
     from ModuleRegistrationLib.anatomy.landmark_suggestions import LandmarkSuggestions
@@ -54,7 +54,7 @@ class PlanningStep(RegistrationStep):
             scene_data.set_points("LandmarksCT", LabelledPoints(tuple(found.labels), found.positions_ras_mm))
             return f"{', '.join(found.labels)}: suggested; check each in the views and move it where needed. {found.note}"
 
-        return Task("Suggest landmarks", suggest, take)
+        return Task("Suggest landmarks", suggest, of_this_ct(take))
 
     def suggestLandmarksBlocked(self) -> str:
         """Why no landmarks can be suggested now."""

@@ -14,7 +14,7 @@ from CranioNavLib.slicer_files import LabelledPoints
 
 from ModuleRegistrationLib import quantities as names
 from ModuleRegistrationLib.logic import results
-from ModuleRegistrationLib.logic.given import RegistrationStep, lacking, pairs, promised, targets
+from ModuleRegistrationLib.logic.given import RegistrationStep, lacking, of_this_ct, pairs, promised, targets
 
 if TYPE_CHECKING:
     from ModuleRegistrationLib.registration.error_theory import PredictedTre
@@ -134,7 +134,8 @@ class RegisteringSteps(RegistrationStep):
             predicted = predict_tre_of(result, places) if result.covariance is not None else None
             return result, judge(problem, result, places), predicted
 
-        return Task("Register surface", register, lambda done: self._takeSurface(landmarks, problem, method, *done))
+        take = of_this_ct(lambda done: self._takeSurface(landmarks, problem, method, *done))
+        return Task("Register surface", register, take)
 
     def registerSurfaceBlocked(self) -> str:
         """Why the surface cannot be registered now."""

@@ -15,7 +15,7 @@ from CranioNavLib.slicer_files import save_scene, write_transform
 
 from ModuleRegistrationLib import quantities as names
 from ModuleRegistrationLib.logic import results
-from ModuleRegistrationLib.logic.given import lacking, pairs, promised, targets
+from ModuleRegistrationLib.logic.given import lacking, of_this_ct, pairs, promised, targets
 from ModuleRegistrationLib.logic.registering import RegisteringSteps
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class VerifyingSteps(RegisteringSteps):
             text = "; ".join([*said, *doubts]) or "verified; see below"  # what agrees stands in the read-outs
             return Reading(text, Level.WARNING) if doubts else text
 
-        return Task("Verify", check, take)
+        return Task("Verify", check, of_this_ct(take))
 
     def _judgedAgain(self, checks: Checks) -> dict[str, str]:
         """Rows of the verdict in view of the checks, which the registration in force takes on; none for landmarks alone."""

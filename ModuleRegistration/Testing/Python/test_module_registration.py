@@ -212,11 +212,38 @@ def test_a_new_registration_forgets_what_was_measured_of_the_old_one(a_patient):
 
 def test_a_new_ct_forgets_what_was_found_in_the_old_one(a_patient):
     a_patient.registerLandmarks()
+    scene_data.set_points("ProtocolPoints", LabelledPoints(("1",), np.zeros((1, 3))))
     a_patient.takeCt(Volume(np.zeros((2, 3, 4), np.int16), np.eye(4), "another"))
-    for role in ("Bone", "OuterTable", "LandmarksCT", "TargetsCT", "Results"):
+    for role in ("Bone", "OuterTable", "LandmarksCT", "TargetsCT", "ProtocolPoints", "Results"):
         assert scene.find(role) is None, role
     np.testing.assert_array_equal(scene_data.get_transform("ReferenceToRas"), np.eye(4))
     assert a_patient.landmarkStatus().state is StepState.TODO
+
+
+def test_what_was_computed_from_the_ct_before_is_not_laid_into_the_next_one(a_patient):
+    a_patient.takeCt(Volume(np.zeros((2, 3, 4), np.int16), np.eye(4), "one"))
+    task = a_patient.findMarkers()
+    a_patient.takeCt(Volume(np.ones((2, 3, 4), np.int16), np.eye(4), "another"))
+    with pytest.raises(InputError, match="another CT has been loaded meanwhile"):
+        task.apply(None)
+    assert scene.find("TargetsCT") is None
+
+
+def test_a_new_ct_says_what_it_keeps_of_the_patient_and_nothing_where_there_was_none(a_patient):
+    first, second = (a_patient.takeCt(Volume(np.zeros((2, 3, 4), np.int16), np.eye(4), "CT")) for _ in range(2))
+    assert first == "CT: 4 × 3 × 2 voxels"
+    assert second.level is Level.WARNING
+    assert "landmarks touched on the patient, bone points" in second.text
+
+
+def test_another_path_is_read_without_the_series_chosen_of_the_one_before(a_logic):
+    model = PanelModel(PANEL, a_logic)
+    field = next(item for item in PANEL.items() if getattr(item, "name", "") == "ct_path")
+    a_logic.parameters().change(ct_path="one", ct_series="4")
+    model.change(field, "one")
+    assert a_logic.parameters().read().ct_series == "4", "the same path again"
+    model.change(field, "another")
+    assert a_logic.parameters().read().ct_series == ""
 
 
 @pytest.fixture
