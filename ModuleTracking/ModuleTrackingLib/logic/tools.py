@@ -46,30 +46,31 @@ class ToolsStep(DeviceInScene[TrackingParameters, PoseStream]):
             raise
 
     def writeFrames(self, frames: list[list[ToolPose]]) -> list[tuple[str, Array]]:
-        """Frames into the scene; returns what was seen of the tools: ToolToReference (4, 4), by name, in order."""
-        written = [found for frame in frames for found in self._writeFrame(frame)]
-        self._writeStale()
-        return written
+        """Frames into the scene, each node written once, with the newest of them: nobody would see the others.
 
-    def _writeFrame(self, frame: list[ToolPose]) -> list[tuple[str, Array]]:
-        """Every tool at the time of this frame, in Reference."""
-        base = next((pose for pose in frame if pose.tool == "Reference"), None)
-        if base is not None and base.usable and base.tool_to_tracker is not None:
-            scene_data.set_transform("ReferenceToTracker", base.tool_to_tracker)
-        written = []
-        for pose in frame:
-            role = f"{pose.tool}ToReference"
-            if role not in scene.ROLES:
+        Returns what was seen of the tools in all frames: ToolToReference (4, 4), by name, in order.
+        """
+        newest: dict[str, tuple[ToolPose, Array | None, PoseStatus]] = {}  # tool -> pose, ToolToReference, its status
+        base, seen = None, []
+        for pose in (pose for frame in frames for pose in frame):
+            if pose.tool == "Reference" and pose.usable and pose.tool_to_tracker is not None:
+                base = pose.tool_to_tracker
+            if f"{pose.tool}ToReference" not in scene.ROLES:
                 continue
             relative = self.running.in_reference_at(pose.tool, pose.host_time_s)
             matrix = relative.tool_to_reference if relative.usable else None
-            scene_data.set_pose(role, matrix, relative.status.value, pose.host_time_s)
+            newest[pose.tool] = pose, matrix, relative.status
             if matrix is not None:
                 tips = self.tips.setdefault(pose.tool, [])
                 tips.append((pose.host_time_s, matrix))
                 del tips[:-TIP_HISTORY]
-                written.append((pose.tool, matrix))
-        return written
+                seen.append((pose.tool, matrix))
+        if base is not None:
+            scene_data.set_transform("ReferenceToTracker", base)
+        for tool, (pose, matrix, status) in newest.items():
+            scene_data.set_pose(f"{tool}ToReference", matrix, status.value, pose.host_time_s)
+        self._writeStale()
+        return seen
 
     def _writeStale(self) -> None:
         """Tools without news lose their pose in the scene, too, even if others or old frames go on coming."""

@@ -31,6 +31,22 @@ def test_poses_reach_the_scene_relative_to_the_reference_base(a_logic):
     assert a_logic.trackerStatus().state is StepState.DONE
 
 
+def test_of_frames_that_come_together_the_scene_hears_once_and_no_tip_is_lost(a_logic):
+    a_logic.connect()
+    run_until(a_logic, seen())
+    heard, node = [], scene.find("StylusToReference")
+    tips = a_logic.tips["Stylus"]
+    before = len(tips)
+    tag = node.AddObserver(
+        node.TransformModifiedEvent, lambda *_: heard.append(scene_data.get_pose("StylusToReference").host_time_s)
+    )
+    time.sleep(0.1)  # the main thread is busy; the tracker goes on
+    a_logic.poll()
+    node.RemoveObserver(tag)
+    assert len(tips) > before + 2
+    assert heard == [tips[-1][0]]
+
+
 def test_a_lost_tool_has_no_pose_in_the_scene(a_logic):
     a_logic.connect()
     run_until(a_logic, seen())
