@@ -51,8 +51,9 @@ class ModuleUltrasoundLogic(PalpationStep, ScriptedLoadableModuleLogic):
         if self.stream is None:
             return
         self.record(self.takeLines())
-        if self.measureLive():
-            self.takePoints()
+        measured = self.measureLive()
+        if measured:
+            self.takePoints(measured)
             self.steer()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Callable, Optional
 
@@ -136,7 +137,7 @@ class LinePoser:
         return posed
 
 
-def recording_of(posed: list[PosedLine], acquisition: Acquisition) -> Recording:
+def recording_of(posed: Sequence[PosedLine], acquisition: Acquisition) -> Recording:
     """Posed lines as a recording in memory, for `measure_lines`. Times count from the first line.
 
     Raises

@@ -21,7 +21,7 @@ from ModuleUltrasoundLib.panel_description import PalpateBy
 
 if TYPE_CHECKING:
     from ModuleUltrasoundLib.devices.line_recorder import LineRecorder
-    from ModuleUltrasoundLib.palpation.palpation import Palpation, PalpationStatus
+    from ModuleUltrasoundLib.palpation.palpation import Palpation, PalpationLine, PalpationStatus
 
 LEFT_MM = 10.0  # a resting probe wanders by 1 to 3 mm; the next point is centimetres away
 ENOUGH = 200  # points of a sweep after which stopping is suggested
@@ -34,7 +34,6 @@ class PalpationStep(SweepStep, MeasureStep):
         super().__init__(parent)
         self.recorder: Optional[LineRecorder] = None
         self._palpated: Optional[PalpationStatus] = None  # its last status
-        self._fedTime = 0.0  # time of the last line that palpation was given
         self._rests: Optional[tuple[int, Array]] = None  # the point just taken, and where the probe stood then (Reference)
 
     def goTo(self, index: int) -> None:
@@ -65,9 +64,9 @@ class PalpationStep(SweepStep, MeasureStep):
 
         path = self.parameters().read().recording_path
         earlier = set_aside(path)
-        first = self.latest[-1].line
-        self.recorder = LineRecorder(path, first, self.running.acquisition)
-        self._fedTime = first.host_time_s
+        assert self.latest is not None  # see startRecordingBlocked
+        self.recorder = LineRecorder(path, self.latest.line, self.running.acquisition)
+        self.measureAnew()
         if self.parameters().read().palpate_by is PalpateBy.SWEEP:
             self.sweep = Sweep()
         elif count_of("ProtocolPoints"):
@@ -79,7 +78,7 @@ class PalpationStep(SweepStep, MeasureStep):
         """Why nothing can be recorded now."""
         if self.recorder is not None:
             return "already recording"
-        if not self.latest:
+        if self.latest is None:
             return self.notConnected() or "no line has come yet"
         return "" if self.parameters().read().recording_path else "choose a file first"
 
@@ -117,25 +116,20 @@ class PalpationStep(SweepStep, MeasureStep):
 
     # Points
 
-    def takePoints(self) -> None:
+    def takePoints(self, lines: list[PalpationLine]) -> None:
         """A point on which the probe has rested long enough is taken, and the next one is asked for; a sweep goes on."""
-        from ModuleUltrasoundLib.palpation.palpation import lines_of
-
-        if self.measured is None or (self.palpation is None and self.sweep is None):
-            return
-        measured = lines_of(self.measured, [item.line.host_time_s for item in self.latest])
-        lines = [line for line in measured if line.time_s > self._fedTime]
-        self._fedTime = max([self._fedTime, *(line.time_s for line in lines)])
-        if self.palpation is None:
+        if self.sweep is not None:
             self.sweepOver(lines)
+        if self.palpation is None:
             return
         new = False
         for line in lines:
             self._palpated = self.palpation.add(line)
             if self._palpated.new_point is not None:
                 new = True
-                resting = next((item for item in reversed(self.latest) if item.pose.usable), None)
-                self._rests = (self.palpation.taken[-1].target, _origin(resting)) if resting is not None else None
+                point = self._palpated.new_point
+                tip_mm = self.running.acquisition.forerun_length_mm + point.line.depth_mm
+                self._rests = (point.target, point.line.position_mm - tip_mm * point.line.beam)
                 self.askNext()
         if new:
             self._showTaken(self.palpation)

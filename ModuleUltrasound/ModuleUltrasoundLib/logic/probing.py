@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING, Any, Optional
 
 import numpy as np
@@ -12,6 +11,7 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.panel import Level, Reading, StepStatus
 from CranioNavLib.rigid import Array
 
+from ModuleUltrasoundLib.devices.line_batches import LineBatch, LineBatches
 from ModuleUltrasoundLib.devices.line_stream import LinePoser, LineStream, PosedLine
 from ModuleUltrasoundLib.logic.planning import ProtocolStep, registered
 
@@ -20,9 +20,7 @@ if TYPE_CHECKING:
 
     from ModuleUltrasoundLib.measurement.measure import LineMeasurements
     from ModuleUltrasoundLib.palpation.guidance import Guide
-
-LIVE_LINES = 12  # that the live depth is read from: a third of a second at 40 lines a second
-LIVE_EVERY_S = 0.2
+    from ModuleUltrasoundLib.palpation.palpation import PalpationLine
 
 
 class ProbeStep(ProtocolStep):
@@ -30,11 +28,13 @@ class ProbeStep(ProtocolStep):
 
     def __init__(self, parent: Any = None) -> None:
         super().__init__(parent)
-        self.latest: list[PosedLine] = []  # the last ones
-        self.measured: Optional[LineMeasurements] = None  # what they say
+        self.latest: Optional[PosedLine] = None  # the last one that came
+        self.measured: Optional[LineMeasurements] = None  # what the last batch of lines says
         self.poser: Optional[LinePoser] = None
         self._observation: Optional[scene.Observation] = None
-        self._measuredTime = 0.0
+        self._batches = LineBatches()
+        self._waiting: list[LineBatch] = []  # to be measured
+        self._shown: Optional[PosedLine] = None  # the last line measured
         self._guide: Optional[Guide] = None  # where the probe stands to the current point
         self._surface: tuple[int, Optional[Surface]] = (0, None)  # time stamp of the mesh; its index is worth keeping
 
@@ -53,8 +53,12 @@ class ProbeStep(ProtocolStep):
             self._observation.stop()
         if self.stream is not None:
             self.stream.stop()
-        self.stream = self.poser = self._observation = self.measured = self._guide = None
-        self.latest = []
+        self.stream = self.poser = self._observation = self.measured = self._guide = self.latest = self._shown = None
+        self.measureAnew()
+
+    def measureAnew(self) -> None:
+        """Lines that came so far say nothing of those to come."""
+        self._batches, self._waiting = LineBatches(), []
 
     def takeLines(self) -> list[PosedLine]:
         """The lines whose pose is known by now, since the last call.
@@ -74,7 +78,9 @@ class ProbeStep(ProtocolStep):
         for line in lines:
             self.poser.add_line(line, self.currentIndex())
         posed = self.poser.ready()
-        self.latest = (self.latest + posed)[-LIVE_LINES:]
+        if posed:
+            self.latest = posed[-1]
+        self._waiting += self._batches.add(posed)
         return posed
 
     def _takePose(self, node: Any) -> None:
@@ -82,20 +88,24 @@ class ProbeStep(ProtocolStep):
         if pose.host_time_s == pose.host_time_s and self.poser is not None:
             self.poser.add_pose(pose.matrix, pose.status, pose.host_time_s)
 
-    def measureLive(self) -> bool:
-        """A few times a second: the last line as a table, and what the last lines say; whether it was time for it."""
+    def measureLive(self) -> list[PalpationLine]:
+        """A few times a second: the last line as a table, and what each line since the last time says."""
         from ModuleUltrasoundLib.devices.line_stream import recording_of
         from ModuleUltrasoundLib.measurement.measure import measure_lines
+        from ModuleUltrasoundLib.palpation.palpation import lines_of
 
-        now = time.monotonic()
-        if not self.latest or now < self._measuredTime + LIVE_EVERY_S:
-            return False
-        self._measuredTime = now
-        acquisition, samples = self.running.acquisition, self.latest[-1].line.samples
-        times = 1e6 / acquisition.sampling_hz * np.arange(len(samples))
-        scene_data.set_table("ALine", {"time (µs)": times.tolist(), "amplitude": samples.tolist()})
-        self.measured = measure_lines(recording_of(self.latest, acquisition), self.parameters().read().echo_settings())
-        return True
+        batches, self._waiting = self._waiting, []
+        lines: list[PalpationLine] = []
+        for batch in batches:
+            recording = recording_of(batch.lines, self.running.acquisition)
+            self.measured = measure_lines(recording, self.parameters().read().echo_settings())
+            lines += lines_of(self.measured, [item.line.host_time_s for item in batch.lines])[-batch.new :]
+            self._shown = batch.lines[-1]
+        if self._shown is not None and batches:
+            samples = self._shown.line.samples
+            times = 1e6 / self.running.acquisition.sampling_hz * np.arange(len(samples))
+            scene_data.set_table("ALine", {"time (µs)": times.tolist(), "amplitude": samples.tolist()})
+        return lines
 
     def steer(self) -> None:
         """Where the probe stands to the bone it has to see, under the registration in force."""
@@ -131,9 +141,9 @@ class ProbeStep(ProtocolStep):
 
     def live(self) -> Optional[tuple[npt.NDArray[np.int16], float, LineMeasurements]]:
         """For a drawing of the last line: its samples, rate in Hz, and what was measured; None without one."""
-        if not self.latest or self.measured is None or not len(self.measured):
+        if self._shown is None or self.measured is None:
             return None
-        return self.latest[-1].line.samples, self.running.acquisition.sampling_hz, self.measured
+        return self._shown.line.samples, self.running.acquisition.sampling_hz, self.measured
 
     def guide(self) -> Optional[Guide]:
         """Where the probe stands to the current point; None without a registration or a live probe."""
@@ -155,7 +165,7 @@ class ProbeStep(ProtocolStep):
         """The bone's depth under the probe now; None while there is no trustworthy echo."""
         from ModuleUltrasoundLib.measurement.quality import reason_in_words
 
-        if self.measured is None or not len(self.measured):
+        if self.measured is None:
             return None
         if not self.measured.accepted[-1]:
             return Reading(reason_in_words(self.measured.reasons[-1]), Level.WARNING)
@@ -163,7 +173,7 @@ class ProbeStep(ProtocolStep):
 
     def quality(self) -> Optional[Reading]:
         """Probability that the depth is right to half a millimetre."""
-        if self.measured is None or not len(self.measured):
+        if self.measured is None:
             return None
         value = float(self.measured.qualities[-1])
         good = value >= self.parameters().read().quality_gate

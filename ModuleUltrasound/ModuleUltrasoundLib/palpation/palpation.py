@@ -18,6 +18,9 @@ from CranioNavLib.rigid import Array
 if TYPE_CHECKING:
     from ModuleUltrasoundLib.measurement.measure import LineMeasurements
 
+NEAR = "near a point already kept"
+POSE_NOISE_MM = 2.0  # between two poses of a probe at rest: a poor tracker has 0.35 mm an axis, that is 0.86 mm RMS
+
 
 @dataclass(frozen=True)
 class PalpationSettings(Parameters):
@@ -228,7 +231,8 @@ class Palpation:
 class Sweep:
     """A gliding probe: every good line is a point, thinned to an even density as they come.
 
-    Of lines nearer to each other than the spacing the surer one stays. `refused` counts the others by reason.
+    Of lines nearer to each other than the spacing the surer one stays. `refused` counts the others by reason: with those kept
+    they are all the lines that came.
     """
 
     def __init__(self, settings: Optional[PalpationSettings] = None) -> None:
@@ -236,7 +240,7 @@ class Sweep:
         self.refused: Counter[str] = Counter()
         self._kept: dict[int, PalpationLine] = {}
         self._cells: dict[tuple[int, ...], set[int]] = {}
-        self._last: Optional[PalpationLine] = None
+        self._way: deque[tuple[float, Array]] = deque()  # when and where the last good lines entered the skin
         self._count = 0
 
     def __len__(self) -> int:
@@ -263,12 +267,17 @@ class Sweep:
             return "pose missing"
         if line.quality < self.settings.least_quality:
             return "echo not sure enough"
-        last, self._last = self._last, line
-        if last is not None and 0 < line.time_s - last.time_s <= self.settings.longest_gap_s:
-            speed = float(np.linalg.norm(line.position_mm - last.position_mm)) / (line.time_s - last.time_s)
-            if speed > self.settings.sweep_speed_mm_s:
-                return "probe too fast"
-        return ""
+        return "probe too fast" if self._too_fast(line) else ""
+
+    def _too_fast(self, line: PalpationLine) -> bool:
+        """Over the longest gap that good lines are looked back for, less what noise moves a probe at rest."""
+        entry = line.position_mm - line.depth_mm * line.beam  # unlike the bone it does not jump with the echo that is chosen
+        self._way.append((line.time_s, entry))
+        while line.time_s - self._way[0][0] > self.settings.longest_gap_s:
+            self._way.popleft()
+        since_s, from_mm = self._way[0]
+        way_mm = float(np.linalg.norm(entry - from_mm)) - POSE_NOISE_MM
+        return way_mm > self.settings.sweep_speed_mm_s * (line.time_s - since_s)
 
     def _keep(self, line: PalpationLine) -> str:
         cell = tuple(int(index) for index in np.floor(line.position_mm / self.settings.sweep_spacing_mm))
@@ -277,8 +286,9 @@ class Sweep:
             key for key in near if np.linalg.norm(self._kept[key].position_mm - line.position_mm) < self.settings.sweep_spacing_mm
         ]
         if any(self._kept[key].quality >= line.quality for key in close):
-            return "near a point already kept"
+            return NEAR
         for key in close:  # this line is surer than all of them
+            self.refused[NEAR] += 1
             old = self._kept.pop(key).position_mm
             self._cells[tuple(int(index) for index in np.floor(old / self.settings.sweep_spacing_mm))].discard(key)
         self._kept[self._count] = line

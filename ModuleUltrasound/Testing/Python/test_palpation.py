@@ -217,6 +217,17 @@ def test_a_probe_that_is_too_fast_gives_no_points():
     assert reasons == ["", *["probe too fast"] * 4]
 
 
+@pytest.mark.parametrize("rate_hz", [40, 200, 1000])
+def test_the_trackers_noise_is_not_taken_for_speed(rate_hz):
+    sweep, rng = Sweep(), np.random.default_rng(rate_hz)
+    for k in range(600):  # 40 mm/s; noise of a poor tracker
+        sweep.add(a_line(k / rate_hz, np.array([40 * k / rate_hz, 0, 0]) + rng.normal(0, 0.35, 3)))
+    assert sweep.refused["probe too fast"] == 0
+    for k in range(rate_hz):
+        sweep.add(a_line(10 + k / rate_hz, np.array([250 * k / rate_hz, 0, 0]) + rng.normal(0, 0.35, 3)))
+    assert sweep.refused["probe too fast"] > 0.85 * rate_hz - 2
+
+
 def test_lines_of_a_sweep_that_are_not_good_are_counted_by_reason():
     sweep = Sweep()
     sweep.add(a_line(0.0, accepted=False, reason="no contact"))
