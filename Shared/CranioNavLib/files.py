@@ -20,9 +20,11 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     Raises
     ------
     InputError
-        The folder is missing or cannot be written to.
+        The folder is missing or cannot be written to, or the path is a folder itself.
     """
     path = Path(path)
+    if path.is_dir():
+        raise InputError(f"cannot write {path}: it is a folder; give the name of a file in it")
     try:
         # "a.igs.mha" -> "a.", ".igs.mha": the suffixes after the first dot stay together
         stem, dot, suffix = path.name.partition(".")

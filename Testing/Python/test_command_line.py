@@ -62,6 +62,7 @@ def test_help_does_not_import_what_is_heavy():
         (["surface", "nowhere.nrrd", "-o", "{tmp}/bone.vtp"], "nowhere.nrrd"),
         (["surface", "{tmp}", "-o", "{tmp}/bone.stl"], "written as .vtp"),
         (["echo", "nowhere.igs.mha", "-o", "{tmp}/d.csv"], "nowhere.igs.mha"),
+        (["echo", "{tmp}/a.igs.mha", "-o", "{tmp}/a.igs.mha"], "is the recording itself"),
         (["markers", "{tmp}", "-o", "{tmp}/m.csv"], ".mrk.json"),
         (["selftest", "ModuleNothing"], "unknown module 'ModuleNothing'"),
         (["plugins", "--load", "{tmp}/none.py"], "no Python file"),

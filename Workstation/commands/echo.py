@@ -20,6 +20,7 @@ def echo(
     from collections import Counter
     from dataclasses import asdict
 
+    from CranioNavLib.errors import InputError
     from CranioNavLib.sequence_metafile import read_recording
     from ModuleUltrasoundLib.echo.search import check_length
     from ModuleUltrasoundLib.measurement.forerun_check import forerun_remark
@@ -29,6 +30,8 @@ def echo(
 
     from Workstation.terminal import print_json, progress_bar
 
+    if output.resolve() == recording.resolve():
+        raise InputError(f"{output} is the recording itself; give the table another name (-o depths.csv)")
     with progress_bar() as say:
         say("reading the recording", 0.0)
         lines = read_recording(recording)

@@ -29,6 +29,13 @@ def test_a_missing_folder_is_refused_in_words(tmp_path):
         write_text(tmp_path / "absent" / "a.json", "{}")
 
 
+def test_a_folder_in_the_place_of_the_file_is_refused_and_left_alone(tmp_path):
+    for path in (tmp_path, ""):
+        with pytest.raises(InputError, match="is a folder; give the name of a file"), written_whole(path):
+            pass
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_folder_that_is_a_file_is_refused(tmp_path):
     (tmp_path / "out").write_text("")
     with pytest.raises(InputError, match="cannot write into"):
