@@ -330,7 +330,7 @@ def main() -> None:
     parser.add_argument("what", nargs="*", help="start, ct, latency, memory; all by default")
     parser.add_argument("--runs", type=int, default=5, help="of the start")
     parser.add_argument("--seconds", type=float, default=20.0, help="of tracking, for the latency")
-    parser.add_argument("--rate", type=float, default=60.0, help="poses a second, for the latency: 60 is usual for a Polaris")
+    parser.add_argument("--rate", type=float, default=60.0, help="poses a second, for the latency: a Polaris Spectra gives 60")
     parser.add_argument("--minutes", type=float, default=10.0, help="of tracking, for the memory")
     wanted = parser.parse_args()
     measurements = {
