@@ -234,7 +234,9 @@ class PanelModel:
         try:
             door.change(**{name: value})
         except InputError as error:
-            self.errors[key] = str(error)
+            kept = getattr(door.read(), name)
+            stays = "" if kept in ("", None) else f"; {getattr(kept, 'value', kept)} is kept"
+            self.errors[key] = _at_its_field(str(error), name) + stays
             self.notify()
             return False
         self.errors.pop(key, None)
@@ -296,3 +298,8 @@ class PanelModel:
 def settings_prefix(kind: str, plugin: str) -> str:
     """Under which a plugin's settings are kept in its module's parameter node."""
     return f"{kind}.{plugin}."
+
+
+def _at_its_field(refusal: str, name: str) -> str:
+    """A refusal as it is said beside the field that it is of, whose label names it."""
+    return refusal.removeprefix(f"parameter {name}").removeprefix(":").strip().removeprefix("is ")

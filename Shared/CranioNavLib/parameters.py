@@ -60,6 +60,8 @@ UNITS = {
     "_ns": "ns",
 }
 
+IN_WORDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
+
 
 @dataclass(frozen=True)
 class Parameters:
@@ -75,7 +77,7 @@ class Parameters:
                 value = float(value)
                 object.__setattr__(self, info.name, value)
             if not isinstance(value, info.kind) or (info.kind is not bool and isinstance(value, bool)):
-                raise InputError(f"{where}: expected {info.kind.__name__}, got {value!r}")
+                raise InputError(f"{where}: expected {IN_WORDS.get(info.kind, info.kind.__name__)}, got {value!r}")
             if info.limits and not info.limits.low <= float(getattr(self, info.name)) <= info.limits.high:
                 raise InputError(f"{where} is {value}; expected {info.limits.low} to {info.limits.high} {info.unit}".rstrip())
 
@@ -148,6 +150,6 @@ def _parse(info: ParameterInfo, text: str) -> Any:
         choices = (
             f"one of {', '.join(str(c.value) for c in info.kind)}"
             if issubclass(info.kind, Enum)
-            else f"a value of type {info.kind.__name__}"
+            else IN_WORDS.get(info.kind, info.kind.__name__)
         )
         raise InputError(f"parameter {info.name}: expected {choices}, got {text!r}") from None

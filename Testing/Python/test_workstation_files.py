@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import urllib.error
 import urllib.request
+import uuid
 from collections.abc import AsyncIterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -174,6 +175,37 @@ def test_a_ct_is_chosen_by_series_or_sent_and_the_page_tells_no_path(tmp_path):
         for secret in (str(tmp_path), str(Path.home()), str(Path.cwd()), str(user_module.ROOT)):
             assert secret not in told
     assert (tmp_path / "session" / "uploads" / "mine.nrrd").is_file()
+
+
+@pytest.mark.parametrize("pasted", ["{}", " {} ", '"{}"', "'{}'", "file://{}"])
+def test_a_pasted_path_is_taken_without_what_came_with_it(places, tmp_path, pasted):
+    path = str(tmp_path / "elsewhere")
+    assert places.typed(pasted.format(path)) == path
+    assert places.typed(pasted.format("~/head")) == str(Path.home() / "head")
+    assert places.typed("file:///a%20b") == "/a b"
+    assert places.typed("scan.igs.mha") == str(tmp_path / "session" / "scan.igs.mha")
+    assert places.typed("  ") == ""
+
+
+def test_a_folder_without_a_ct_or_that_may_not_be_read_says_so(places, tmp_path, monkeypatch):
+    from trame.app import get_server
+
+    from Workstation.web.session_files_view import FilesDialog
+
+    (tmp_path / "data" / "patient" / "slice").unlink()
+    server = get_server(f"files-{uuid.uuid4()}", client_type="vue3")
+    dialog = FilesDialog(server, places, lambda path, series: None, lambda compute, finished: None)
+    dialog.open("data/patient")
+    assert "Nothing in data/patient is a CT" in server.state.picker["message"]
+    dialog.open("data")
+    assert server.state.picker["message"] == ""
+
+    def locked(where: str) -> None:
+        raise PermissionError(13, "Permission denied", str(tmp_path))
+
+    monkeypatch.setattr(places, "listing", locked)
+    dialog.open("data/patient")
+    assert server.state.picker["message"].startswith("! data/patient cannot be read: Permission denied; choose another")
 
 
 def test_a_typed_path_leads_nowhere_else_once_the_page_is_served_to_others(places, tmp_path):

@@ -126,8 +126,25 @@ def test_an_edit_in_the_browser_reaches_the_scene(an_empty_scene):
 def test_a_refused_edit_is_said_at_its_field_and_changes_nothing(an_empty_scene):
     view, _ = drawn_in_the_web("ModuleRegistration")
     view.server.controller.trigger_fn("panel_change")("marker_diameter_mm", "600")
-    assert "expected 1" in view.server.state.panel["errors"]["marker_diameter_mm"]
+    assert view.server.state.panel["errors"]["marker_diameter_mm"] == "600.0; expected 1 to 20 mm; 4.0 is kept"
     assert view.model.logic.parameters().read().marker_diameter_mm == 4.0
+
+
+def test_a_number_that_is_none_is_refused_in_words_and_one_that_need_not_be_given_can_be_emptied(an_empty_scene):
+    view, _ = drawn_in_the_web("ModuleTracking")
+    change = view.server.controller.trigger_fn("panel_setting")
+    field = next(item for item in view.model.panel.items() if getattr(item, "kind", "") == "tracker")
+    for value, kept, said in (("5", 5.0, None), ("abc", 5.0, "expected a number, got 'abc'; 5.0 is kept"), ("", None, None)):
+        change(field.name, "fail_after_s", value)
+        assert view.model.settings(field).read().fail_after_s == kept
+        assert view.server.state.panel["errors"].get(f"{field.name}.fail_after_s") == said
+
+
+def test_a_button_is_grey_again_once_what_was_typed_beside_it_has_come(an_empty_scene):
+    view, _ = drawn_in_the_web("ModuleTracking")
+    view.server.state.typed = "panel.sharing"
+    view.server.controller.trigger_fn("panel_change")("share_port", "18945")
+    assert view.server.state.typed == ""
 
 
 def test_a_blocked_action_says_why(an_empty_scene):

@@ -15,7 +15,7 @@ from Workstation.web.drawings_view import STYLE as DRAWINGS_STYLE
 from Workstation.web.drawings_view import draw_live
 from Workstation.web.keyboard import draw_help
 from Workstation.web.panel_view import PanelView
-from Workstation.web.procedure import HAND, SESSION, ProcedureStep
+from Workstation.web.procedure import DEVICES, HAND, SESSION, ProcedureStep
 from Workstation.web.session_files_view import draw_files
 from Workstation.web.session_link import draw_link
 from Workstation.web.session_resume_view import draw_resuming
@@ -54,6 +54,11 @@ html { overflow: hidden; }
   outline: 3px solid #ffd54f; outline-offset: 4px; }
 .v-field :focus-visible, .v-selection-control__input :focus-visible, [tabindex="-1"]:focus-visible,
 .v-overlay__content:focus-visible { outline: none !important; }
+.disclaimer { flex: 1 1 0; min-width: 110px; margin: 0 12px; text-align: right; font-size: 13px; line-height: 1.2; }
+.v-toolbar__content > :not(.disclaimer) { flex-shrink: 0; }
+.v-toolbar__content { overflow-x: auto; overflow-y: hidden; }
+@media (max-width: 1000px) { .title { display: none; } }
+.part .v-input--density-compact { margin-top: 14px !important; }
 .part { border-top: 1px solid rgba(255, 255, 255, 0.12); padding-top: 12px; margin-top: 12px; }
 """
 
@@ -87,10 +92,9 @@ class Page:
 
     def _draw_title(self, procedure: tuple[ProcedureStep, ...]) -> None:
         with v3.VAppBar(density="compact", flat=True, border=True):
-            v3.VAppBarTitle(words.TITLE, style="flex: none")
-            v3.VChip(words.SIMULATED, v_if="simulated", color="warning", variant="flat", size="small", classes="ml-3")
-            v3.VSpacer()
-            html.Div(words.DISCLAIMER, classes="text-body-2 text-medium-emphasis mr-4")
+            v3.VAppBarTitle(words.TITLE, style="flex: none", classes="title")
+            v3.VChip(words.SIMULATED, v_if="simulated", color="warning", variant="flat", size="small", classes="ml-3 flex-0-0")
+            html.Div(words.DISCLAIMER, classes="disclaimer text-medium-emphasis")
             draw_toolbar()
             draw_sounds()
             draw_help(procedure, self.panels)
@@ -171,12 +175,15 @@ class Page:
         )
 
     def _draw_ways(self, step: ProcedureStep, before: tuple[ProcedureStep, ...], after: ProcedureStep | None, done: str) -> None:
-        """Back to the first step that is not done where this one waits for it; and on."""
+        """Back to the first step that is not done where this one waits for it; and on. What is under way waits for none but the
+        devices, which may have been lost."""
         earlier = ", ".join(
             f"{{ name: '{one.name}', title: '{number} {one.title}', state: {self._state_of(one)} }}"
             for number, one in enumerate(before, start=1)
         )
-        waits = f"(({done}) || {self._offer(step)} ? [] : [{earlier}].filter(one => one.state !== 'done').slice(0, 1))"
+        under_way = f"{self._state_of(step)} === 'needs attention'"
+        missing = f"[{earlier}].filter(one => one.state !== 'done' && (!({under_way}) || one.name === '{DEVICES}'))"
+        waits = f"(({done}) || {self._offer(step)} ? [] : {missing}.slice(0, 1))"
         v3.VBtn(
             f"{words.FIRST} {{{{ one.title }}}}",
             v_for=f"one in {waits}",

@@ -73,6 +73,8 @@ def parse(info: ParameterInfo, value: Any) -> Any:
     """What the page sent, as the parameter's own type; what cannot be one is passed on, to be refused in words."""
     if issubclass(info.kind, Enum):
         return info.kind(value)
+    if info.optional and info.kind is not str and value == "":
+        return None  # an emptied field: not given
     if info.kind in (int, float) and value not in (None, ""):
         try:
             return info.kind(value)

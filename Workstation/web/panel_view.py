@@ -264,6 +264,7 @@ class PanelView:
         if isinstance(value, str):
             value = self._typed(value) if isinstance(field, FileField) else self._meant(value)
         self.model.change(field, parse(self.model.describe(field), value))
+        self._is_typed()
 
     def _change_setting(self, name: str, setting: str, value: Any) -> None:
         field = self._field(name)
@@ -272,6 +273,12 @@ class PanelView:
             info = next(one for one in door.kind.describe() if one.name == setting)
             value = self._typed(value) if isinstance(value, str) and setting.endswith(OF_PATHS) else value
             self.model.change_setting(field, setting, parse(info, value))
+        self._is_typed()
+
+    def _is_typed(self) -> None:
+        """What was being typed has come: from now on the buttons of its part can be pressed as it allows."""
+        with self.server.state as shared:
+            shared.typed = ""
 
     def _pick(self, name: str, entry: str) -> None:
         self._speaks(name)

@@ -16,11 +16,12 @@ class ProcedureStep:
 
 REGISTRATION, TRACKING, ULTRASOUND = "ModuleRegistration", "ModuleTracking", "ModuleUltrasound"
 HAND, SESSION, NAVIGATION = "SimulatedHand", "Session", "Navigation"
+DEVICES = "devices"
 
 PROCEDURE: tuple[ProcedureStep, ...] = (
     ProcedureStep("ct", "CT", ((SESSION, "resume"), (HAND, "patient"), (REGISTRATION, "ct"))),
     ProcedureStep("bone", "Bone and landmarks", ((REGISTRATION, "bone"), (REGISTRATION, "plan"))),
-    ProcedureStep("devices", "Devices", ((TRACKING, "tracker"), (ULTRASOUND, "device"), (TRACKING, "sharing"))),
+    ProcedureStep(DEVICES, "Devices", ((TRACKING, "tracker"), (ULTRASOUND, "device"), (TRACKING, "sharing"))),
     ProcedureStep("calibration", "Calibration", ((HAND, "pivot"), (TRACKING, "calibration"), (TRACKING, "base"))),
     ProcedureStep("landmarks", "Landmarks", ((HAND, "landmarks"), (TRACKING, "points"), (REGISTRATION, "landmarks"))),
     ProcedureStep(

@@ -40,6 +40,7 @@ def serve(
     def bound(web: Any) -> None:
         web.app.middlewares.append(_gate(token))
         web.app.router.add_get("/session/{name}", _file_of(application))
+        web.app.router.add_post("/paraview/", _tell_socket)
         web.app.router.add_get(f"/{ALIVE}", _alive_of(application.windows))
         web.app.router.add_post("/upload", _upload_of(application))
         web.app.router.add_get(f"/{PICTURES}", application.pictures.serve)
@@ -98,6 +99,15 @@ def _gate(token: str) -> Any:
         return response
 
     return gate
+
+
+async def _tell_socket(request: Any) -> Any:
+    """Answers trame's page, which asks a launcher for its websocket before it takes this server's: unanswered, every start
+    would leave an error in the browser's console."""
+    from aiohttp import web
+
+    scheme = "wss" if request.scheme == "https" else "ws"
+    return web.json_response({"sessionURL": f"{scheme}://USE_HOST/ws"})
 
 
 def _alive_of(windows: Any) -> Any:

@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 from CranioNavLib.errors import InputError
 
@@ -65,11 +66,18 @@ class Places:
             return f"{name}/{Path(rest).name}"
 
     def typed(self, text: str) -> str:
-        """The path that was typed into a field for one. Confined, any other than of the two folders is looked for in the
-        session's by its name alone."""
-        if not self._confined or not text.strip() or text.partition("/")[0] in self.roots():
+        """The path that was typed or pasted into a field for one, without the quotes, blanks or `file://` that came with it;
+        a relative one that is not there is meant in the session's folder. Confined, any other than of the two folders is
+        looked for in the session's by its name alone."""
+        text = text.strip().strip("\"'").strip()
+        if text.startswith("file://"):
+            text = unquote(text[len("file://") :])
+        if not text or text.partition("/")[0] in self.roots():
             return self.meant(text)
-        return str(Path(self._session.folder) / (re.split(r"[/\\]", text.strip())[-1].strip(".") or UPLOADS))
+        if not self._confined:
+            path = Path(text).expanduser() if text.startswith("~") else Path(text)
+            return str(path if path.is_absolute() or path.exists() else Path(self._session.folder) / path)
+        return str(Path(self._session.folder) / (re.split(r"[/\\]", text)[-1].strip(".") or UPLOADS))
 
     def resolve(self, text: str) -> Path:
         """The path of a name that the page gave.

@@ -12,6 +12,7 @@ from trame.widgets import vuetify3 as v3
 from Workstation.web.session_files import Places
 
 CLOSED = {"open": False, "where": "", "up": None, "entries": [], "series": [], "ct": "", "message": ""}
+NOTHING_HERE = "Nothing in {where} is a CT (DICOM, NRRD, NIfTI or MetaImage): choose another folder."
 SCRIPT = """
 (() => {
   if (window.cranionavUpload) return;
@@ -70,9 +71,14 @@ class FilesDialog:
     def open(self, where: str = "") -> None:
         """Show what there is in a folder."""
         try:
-            self._show(open=True, message="", series=[], **self._places.listing(where))
-        except (InputError, OSError) as error:
+            listing = self._places.listing(where)
+        except OSError as error:
+            self._say(InputError(f"{where} cannot be read: {error.strerror}; choose another folder, or have it made readable"))
+        except InputError as error:
             self._say(error)
+        else:
+            nothing = "" if listing["entries"] or not where else NOTHING_HERE.format(where=where)
+            self._show(open=True, message=nothing, series=[], **listing)
 
     def pick(self, path: str) -> None:
         """Load a CT; of a folder with several series, ask which."""

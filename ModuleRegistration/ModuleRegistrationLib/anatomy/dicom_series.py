@@ -92,6 +92,10 @@ def list_series(folder: Path) -> list[tuple[str, str]]:
 
 def _read_headers(folder: Path) -> list[Slice]:
     pydicom: Any = importlib.import_module("pydicom")
+    try:
+        next(folder.iterdir(), None)  # below, a folder that may not be read would pass for an empty one
+    except OSError as error:
+        raise InputError(f"cannot read {folder}: {error.strerror or error}; check the folder's permissions") from None
     files = sorted(item for item in folder.rglob("*") if item.is_file() and not item.name.startswith("."))
     if not files:
         raise InputError(f"the folder {folder} is empty; give the folder that holds the CT's DICOM files")
@@ -143,7 +147,10 @@ def _choose(groups: list[list[Slice]], series: Optional[str], folder: Path) -> l
     volumes = [group for group in groups if _is_ct(group) and len(group) >= FEWEST_SLICES]
     if len(volumes) == 1:  # beside localizers, dose reports and other modalities
         return volumes[0]
-    raise InputError(f"{folder} holds {len(groups)} series: {_listed(groups)}; say which by its number (--series NUMBER)")
+    raise InputError(
+        f"{folder} holds {len(groups)} series: {_listed(groups)}; give the number of one as the series "
+        "(in the panel: Details, Series; in the console: --series NUMBER)"
+    )
 
 
 def _is_ct(group: Sequence[Slice]) -> bool:

@@ -92,6 +92,14 @@ def test_a_tilted_gantry_is_resampled_onto_a_rectangular_grid(a_dicom_folder, a_
     assert at(read, true) == pytest.approx(at(a_smooth_ct, Grid.of(a_smooth_ct).to_ras(index)), abs=12)
 
 
+def test_a_folder_that_may_not_be_read_is_not_called_empty(tmp_path, monkeypatch):
+    def locked(folder):
+        raise PermissionError(13, "Permission denied", str(folder))
+
+    monkeypatch.setattr(Path, "iterdir", locked)
+    refused(tmp_path, "cannot read .*: Permission denied; check the folder's permissions")
+
+
 def test_several_series_are_listed_and_asked_for(a_dicom_folder, ball):
     a_dicom_folder(ball, name="all/a", number=3)
     folder = a_dicom_folder(Volume(ball.hu + np.int16(7), ball.ijk_to_ras), name="all/b", number=4).parent
