@@ -75,7 +75,7 @@ class Places:
         if not text or text.partition("/")[0] in self.roots():
             return self.meant(text)
         if not self._confined:
-            path = Path(text).expanduser() if text.startswith("~") else Path(text)
+            path = Path.home() / text[2:] if text == "~" or text.startswith("~/") else Path(text)
             return str(path if path.is_absolute() or path.exists() else Path(self._session.folder) / path)
         return str(Path(self._session.folder) / (re.split(r"[/\\]", text)[-1].strip(".") or UPLOADS))
 
