@@ -86,6 +86,14 @@ def test_landmarks_are_placed_moved_and_taken_back_in_the_views(tmp_path):
         user.page.keyboard.press("p")
         by_keys = wait_until_saved(user, folder, lambda found: "Nasion" in found)
         np.testing.assert_allclose(by_keys["Nasion"], np.add(on_bone["Nasion"], (1, 10, 0)), atol=0.1)  # there the slices went
+
+        head = user.page.locator(".layout-grid-item").nth(2)
+        for key in ("l", "i", "+"):
+            user.page.wait_for_timeout(1000)
+            before = head.screenshot()
+            user.page.keyboard.press(key)
+            user.page.wait_for_timeout(1000)
+            assert head.screenshot() != before, f"the head stands still after {key}"
         assert user.defects == []
 
 

@@ -9,6 +9,8 @@ import pytest
 from CranioNavLib import host, scene, scene_data, slice_views
 from CranioNavLib.slicer_files import LabelledPoints
 from CranioNavLib.surface import Surface
+from hypothesis import given
+from hypothesis import strategies as st
 from vtkmodules.util.numpy_support import vtk_to_numpy
 
 from Workstation.web import color_scale, error_views, framing
@@ -341,7 +343,7 @@ def test_the_lit_grey_window_is_the_one_that_the_slices_have(an_empty_scene):
     from Workstation.web.view_controls import ViewControls
 
     server = SimpleNamespace(state=SimpleNamespace(), controller=SimpleNamespace(trigger=lambda name: lambda function: None))
-    controls = ViewControls(server, None, lambda: None)
+    controls = ViewControls(server, None, None, lambda: None)
     display = scene_data.set_volume("CT", Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), "nothing")).GetDisplayNode()
     display.SetWindowLevel(1500.0, 300.0)  # as dragging does
     controls.look()
@@ -350,3 +352,44 @@ def test_the_lit_grey_window_is_the_one_that_the_slices_have(an_empty_scene):
     assert (display.GetWindow(), display.GetLevel()) == (2000.0, 400.0)
     controls.look()
     assert server.state.window == "bone"
+
+
+@given(st.floats(0.2, 3.0), st.floats(-3.1, 3.1), st.lists(st.sampled_from("JLIK"), min_size=1, max_size=30))
+def test_turning_by_keys_keeps_the_distance_and_the_head_upright_and_back_undoes_it(far, round_rad, keys):
+    from vtkmodules.vtkRenderingCore import vtkCamera
+
+    from Workstation.web.turning import turn
+    from Workstation.web.view_controls import TURNS_DEG
+
+    camera, middle = vtkCamera(), np.array([3.0, -20.0, 40.0])
+    camera.SetFocalPoint(*middle)
+    camera.SetPosition(*(middle + 100 * far * np.array([np.cos(round_rad), np.sin(round_rad), 0.3])))
+    for key in keys:
+        turn(camera, *TURNS_DEG[key])
+        assert camera.GetDistance() == pytest.approx(100 * far * np.hypot(1, 0.3), rel=1e-9)
+        assert camera.GetViewUp() == (0, 0, 1)
+        assert abs(camera.GetDirectionOfProjection()[2]) < 0.997  # never along it: the picture would turn over
+    before = np.array(camera.GetPosition())
+    for key in "JL":
+        turn(camera, *TURNS_DEG[key])
+    np.testing.assert_allclose(camera.GetPosition(), before, atol=1e-6)
+
+
+def test_turning_to_the_right_is_as_vtk_turns_a_camera():
+    from vtkmodules.vtkRenderingCore import vtkCamera
+
+    from Workstation.web.turning import come_nearer, turn
+
+    ours, theirs = vtkCamera(), vtkCamera()
+    for camera in (ours, theirs):
+        camera.SetPosition(0.0, 300.0, 0.0)  # the patient's face
+        camera.SetViewUp(0.0, 0.0, 1.0)
+    turn(ours, 15, 0)
+    theirs.Azimuth(15)
+    np.testing.assert_allclose(ours.GetPosition(), theirs.GetPosition(), atol=1e-9)
+    turn(ours, 0, 15)
+    theirs.Elevation(15)
+    np.testing.assert_allclose(ours.GetPosition(), theirs.GetPosition(), atol=1e-9)
+    come_nearer(ours, 1.2)
+    theirs.Dolly(1.2)
+    np.testing.assert_allclose(ours.GetPosition(), theirs.GetPosition(), atol=1e-9)

@@ -80,7 +80,7 @@ class WorkstationApp(TrameApp):
         self._use_folder()
         self.views, self.cues, self.tilt = ViewFollower(self.slicer, self.runner.start), Cues(), TiltTone()
         self.resuming = Resuming(self.server.state)
-        self.controls = ViewControls(self.server, self.layouts, self.views.fit)
+        self.controls = ViewControls(self.server, self.layouts, self.slicer.view_manager, self.views.fit)
         self.server.state.legend, self.server.state.cue, self.server.state.muted = None, {}, False
         self.server.state.tilt = self.tilt.next(None)
         self.server.state.live = drawings(self.logics[ULTRASOUND])

@@ -10,7 +10,7 @@ from Workstation.web import words
 from Workstation.web.panel_view import PanelView
 from Workstation.web.procedure import HAND, ProcedureStep
 from Workstation.web.toolbar import KEYS
-from Workstation.web.view_controls import STEPS_MM
+from Workstation.web.view_controls import SIZES, STEPS_MM, TURNS_DEG
 
 # Another step is seen from its beginning, and Tab goes on from there.
 # Text fields keep their keys; a button, list or slider reached by Tab keeps those that work it, one that was clicked does not.
@@ -107,10 +107,11 @@ def _draw_hidden(procedure: tuple[ProcedureStep, ...]) -> None:
     for key, way in (("N", 1), ("B", -1)):
         onwards = f"step = {names}[Math.min({len(procedure) - 1}, Math.max(0, {names}.indexOf(step) + {way}))]"
         html.Button(style="display: none", click=onwards, raw_attrs=[f'data-key="{key}"'])
-    for key in STEPS_MM:
-        for far, shift in ((False, ""), (True, "Shift+")):
-            html.Button(
-                style="display: none",
-                click=f"trigger('view_move', ['{key}', {str(far).lower()}])",
-                raw_attrs=[f'data-key="{shift}{key}"', 'data-repeats="yes"'],
-            )
+    moves = [
+        (f"{shift}{key}", f"view_move', ['{key}', {far}")
+        for key in STEPS_MM
+        for shift, far in (("", "false"), ("Shift+", "true"))
+    ]
+    turns = [(key, f"view_turn', ['{key}'") for key in TURNS_DEG] + [(key, f"view_size', ['{key}'") for key in SIZES]
+    for key, call in (*moves, *turns):
+        html.Button(style="display: none", click=f"trigger('{call}])", raw_attrs=[f'data-key="{key}"', 'data-repeats="yes"'])

@@ -22,6 +22,8 @@ KEYS = (
     ("E", words.ERROR_COLORS),
     ("M", words.SOUNDS),
     (words.MOVE_KEYS, words.MOVE),
+    (words.TURN_KEYS, words.TURN),
+    (words.SIZE_KEYS, words.SIZE),
     ("?", words.SHOW_KEYS),
 )
 

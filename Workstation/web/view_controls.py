@@ -1,4 +1,4 @@
-"""What the user does with the views as a whole: layout, grey window, what dragging does, reset, moving the crossing by keys."""
+"""What the user does with the views as a whole: layout, grey window, what dragging does, reset, moving and turning by keys."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from CranioNavLib import host, scene, slice_views
 
 from Workstation.web.error_views import MAP
+from Workstation.web.turning import come_nearer, enlarge_slice, turn
 
 
 @dataclass(frozen=True)
@@ -52,13 +53,15 @@ STEPS_MM = {
     "PageDown": (0, 0, -1),
 }  # in RAS, as radiology looks at an axial slice: the patient's right is at the left of the screen
 FAR_MM = 10.0  # with Shift
+TURNS_DEG = {"J": (-15, 0), "L": (15, 0), "I": (0, 15), "K": (0, -15)}  # of the eye about the head: to its right, and up
+SIZES = {"+": 1.2, "-": 1 / 1.2}
 
 
 class ViewControls:
-    """Serves the toolbar and the keys; `fit` frames all views anew."""
+    """Serves the toolbar and the keys; `view_manager` knows the views, `fit` frames all of them anew."""
 
-    def __init__(self, server: Any, layouts: Any, fit: Callable[[], None]) -> None:
-        self._state, self._layouts, self._fit = server.state, layouts, fit
+    def __init__(self, server: Any, layouts: Any, view_manager: Any, fit: Callable[[], None]) -> None:
+        self._state, self._layouts, self._manager, self._fit = server.state, layouts, view_manager, fit
         self._state.layout, self._state.window, self._state.drag_window, self._state.error_shown = "four", "bone", False, MAP
         for name, function in {
             "layout": self.show_layout,
@@ -66,6 +69,8 @@ class ViewControls:
             "drag": self.drag_sets_window,
             "reset": self.reset,
             "move": self.move,
+            "turn": self.turn,
+            "size": self.size,
         }.items():
             server.controller.trigger(f"view_{name}")(function)
 
@@ -115,6 +120,24 @@ class ViewControls:
         place = slice_views.crossing()
         if place is not None and key in STEPS_MM:
             slice_views.go_to(place + np.array(STEPS_MM[key]) * (FAR_MM if far else 1.0))
+
+    def turn(self, key: str) -> None:
+        """Look at the head in 3-D from further left (J), right (L), above (I) or below (K)."""
+        if key in TURNS_DEG:
+            self._change_3d(lambda camera: turn(camera, *TURNS_DEG[key]))
+
+    def size(self, key: str) -> None:
+        """All views larger or smaller."""
+        if key in SIZES:
+            self._change_3d(lambda camera: come_nearer(camera, SIZES[key]))
+            for node in slice_views.slice_nodes():
+                enlarge_slice(node, SIZES[key])
+
+    def _change_3d(self, change: Callable[[Any], None]) -> None:
+        for view in self._manager.get_threed_views():
+            change(view.renderer().GetActiveCamera())
+            view.renderer().ResetCameraClippingRange()
+            view.schedule_render()
 
 
 def layout_grid() -> dict[str, Any]:

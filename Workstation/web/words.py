@@ -28,6 +28,8 @@ TAB_KEYS, TAB = "Tab, Shift+Tab", "To the next button, field, list or view, or b
 STEP_ON, STEP_BACK, SHOW_KEYS = "Next step", "Step before", "Show or hide this list"
 MOVE_KEYS = "Arrows, Page up/down"
 MOVE = "Move the slices by 1 mm (Shift: 10 mm), where the step itself has no use for the key"
+TURN_KEYS, TURN = "J, L, I, K", "Look at the head in 3-D from further left, right, above, below"
+SIZE_KEYS, SIZE = "+, -", "All views larger, or smaller"
 LAYOUTS = {
     "four": "Four views",
     "wide": "Large 3-D, slices beside it",
