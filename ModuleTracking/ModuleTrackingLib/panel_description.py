@@ -34,7 +34,7 @@ class TrackingParameters(Parameters):
     """What the tracking module keeps in the scene."""
 
     tracker: Annotated[str, "where poses come from"] = "simulated"
-    tool: Annotated[Tool, "tool that is calibrated or digitises"] = Tool.STYLUS
+    tool: Annotated[Tool, "tool that is calibrated, or whose tip is read"] = Tool.STYLUS
     points: Annotated[PointList, "list that the next point goes to"] = PointList.LANDMARKS
     rest_s: Annotated[float, Limits(0.1, 10), "how long the tip must rest on a point"] = 0.7
     pivot_s: Annotated[float, Limits(1, 120), "how long the tool is pivoted for its calibration"] = 10.0
@@ -111,6 +111,20 @@ PANEL = Panel(
                 NodeField("PlausibilityPoints", "Plausibility"),
             ),
             status="pointsStatus",
+        ),
+        Step(
+            name="checks",
+            title="Markers and check points",
+            help="To verify: read the markers (targets) one after another, with the sphere tool or the stylus, and some places "
+            "anywhere on the bone with the stylus.",
+            items=(
+                ReadOut("nextMarker", "Next marker", large=True),
+                Action("readMarker", "Read marker", "Add the resting tip to the measured targets"),
+                Action("readPlausibility", "Read bone", "Add the resting tip to the plausibility points"),
+                Action("undoCheck", "Undo the last one", "Remove what was read last of these"),
+                ReadOut("checksRead", "Read"),
+                ParameterField("tool", "Read with"),
+            ),
         ),
         Step(
             name="sharing",

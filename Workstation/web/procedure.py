@@ -35,7 +35,7 @@ PROCEDURE: tuple[ProcedureStep, ...] = (
             (REGISTRATION, "surface"),
         ),
     ),
-    ProcedureStep("verification", "Verification", ((HAND, "targets"), (REGISTRATION, "verification"))),
+    ProcedureStep("verification", "Verification", ((HAND, "targets"), (TRACKING, "checks"), (REGISTRATION, "verification"))),
     ProcedureStep("navigation", "Navigation", ((NAVIGATION, "navigation"), (HAND, "tour"))),
     ProcedureStep("report", "Report and export", ((SESSION, "report"),)),
 )

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Optional, Union
 
 import numpy as np
-from CranioNavLib import scene_data
+from CranioNavLib import scene, scene_data
 from CranioNavLib.files import output_folder
 from CranioNavLib.module_logic import done_or
 from CranioNavLib.panel import Level, Progress, Reading, StepState, StepStatus, Task
@@ -52,6 +52,7 @@ class VerifyingSteps(RegisteringSteps):
             said = [f"TRE {errors.mean_mm:.2f} mm (mean), {errors.max_mm:.2f} mm (largest)"] if errors else []
             said += [f"plausibility {distances.max_mm:.2f} mm (largest)"] if distances else []
             doubts = [sentence for sentence in checks.confidence.sentences() if results.contradicts(sentence)]
+            doubts += [self._tooFarOff()] if errors and self._tooFarOff() else []
             text = "; ".join([*said, *doubts]) or "verified; see below"  # what agrees stands in the read-outs
             return Reading(text, Level.WARNING) if doubts else text
 
@@ -124,8 +125,24 @@ class VerifyingSteps(RegisteringSteps):
         return "" if "" in missing or self._verifiable() or self._isReadBack() else missing[0]
 
     def measuredTre(self) -> Optional[Reading]:
-        """Measured TRE."""
-        return results.reading(names.TRE_MEAN, " ± ", names.TRE_SD, "; ", names.TRE_MAX)
+        """Measured TRE; bad where it is above the limit."""
+        found = results.reading(names.TRE_MEAN, " ± ", names.TRE_SD, "; ", names.TRE_MAX)
+        if found is None:
+            return None
+        if len(_measured()) == 1:  # one has no SD
+            found = replace(found, text=f"one marker: {found.text.split(' ')[0]} mm")
+        return replace(found, level=Level.BAD) if self._tooFarOff() else found
+
+    def _tooFarOff(self) -> str:
+        """In words, which target was measured to lie further off than the limit, and what to do; "" if none."""
+        limit_mm = self.parameters().read().tre_limit_mm
+        name, off_mm = max(_measured().items(), key=lambda item: item[1], default=("", 0.0))
+        if off_mm <= limit_mm:
+            return ""
+        return (
+            f"{name} was measured {off_mm:.1f} mm off, above the limit of {limit_mm:g} mm: measure it again; if that does not help, "
+            "palpate more points and register again"
+        )
 
     def plausibility(self) -> Optional[Reading]:
         """Largest distance of a plausibility point."""
@@ -153,6 +170,8 @@ class VerifyingSteps(RegisteringSteps):
         doubts = [f"{name}: {rows[name]}" for name in (names.TOUCHED, names.HELD_OUT) if results.contradicts(rows.get(name, ""))]
         if doubts:
             return StepStatus(StepState.ATTENTION, "; ".join(doubts))
+        if names.TRE_MEAN in rows and self._tooFarOff():
+            return StepStatus(StepState.ATTENTION, self._tooFarOff(), "verify")
         verified = any(name in rows for name in (names.TRE_MEAN, names.PLAUSIBILITY_MAX, names.HELD_OUT, names.BELOW_LIMIT))
         return done_or(verified, self.verifyBlocked() or "verify the registration")
 
@@ -168,3 +187,11 @@ class VerifyingSteps(RegisteringSteps):
         if not results.status():
             return "register first"
         return "" if self.parameters().read().output_folder else "choose a folder first"
+
+
+def _measured() -> dict[str, float]:
+    """TRE of each target that was measured on the patient, mm."""
+    if scene.find("TargetErrors") is None:
+        return {}
+    columns = scene_data.get_table("TargetErrors")
+    return dict(zip(map(str, columns["target"]), map(float, columns["TRE (mm)"])))

@@ -199,6 +199,28 @@ def test_the_held_out_points_alone_can_be_verified(a_patient):
     assert a_patient.verificationStatus().state is StepState.DONE
 
 
+@pytest.mark.parametrize(("off_mm", "count"), [(0.0, 4), (9.0, 4), (0.0, 1)])
+def test_a_target_measured_further_off_than_the_limit_is_named_and_no_good_news(a_patient, off_mm, count):
+    places = np.array([[0.0, 20, 30], [20, 0, 40], [-20, 10, 30], [5, -20, 50]])[:count]
+    touched = transform_points(invert_rigid(TRUTH), places)
+    touched[count - 1, 2] += off_mm
+    labels = tuple("abcd"[:count])
+    scene_data.set_points("TargetsCT", LabelledPoints(labels, places))
+    scene_data.set_points("TargetsPatient", LabelledPoints(labels, touched))
+    a_patient.registerSurface().run()
+    said = a_patient.verify().run()
+    reading, status = a_patient.measuredTre(), a_patient.verificationStatus()
+    if off_mm:
+        assert status.state is StepState.ATTENTION
+        assert status.text.startswith("d was measured ")
+        assert "above the limit of 2 mm: measure it again" in status.text
+        assert (reading.level, said.level) == (Level.BAD, Level.WARNING)
+    else:
+        assert status.state is StepState.DONE
+        assert reading.level is not Level.BAD
+        assert reading.text.startswith("one marker: ") == (count == 1)
+
+
 def test_a_new_registration_forgets_what_was_measured_of_the_old_one(a_patient):
     a_patient.registerLandmarks()
     a_patient.registerSurface().run()

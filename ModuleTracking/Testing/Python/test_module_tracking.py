@@ -145,6 +145,22 @@ def test_a_tool_out_of_view_is_no_point(a_logic):
         a_logic.digitise()
 
 
+def test_markers_and_places_on_the_bone_are_read_to_verify_with_and_taken_back_in_order(a_logic):
+    a_logic.connect()
+    assert "the CT shows no targets" in a_logic.readMarkerBlocked()
+    scene_data.set_points("TargetsCT", LabelledPoints(("T 1", "T 2"), np.eye(2, 3) * 50))
+    steps = [(a_logic.readMarker, "T 1"), (a_logic.readPlausibility, "P1"), (a_logic.readMarker, "T 2")]
+    for number, (read, label) in enumerate(steps):
+        Script.tools = {"Stylus": rigid(np.eye(3), DIVOT + [30.0 * number, 0, 0])}
+        run_for(a_logic, 0.3)
+        assert read().startswith(label)
+    assert "every marker is read" in a_logic.readMarkerBlocked()
+    assert a_logic.checksRead().text == "2 of 2 markers, 1 place on the bone"
+    assert scene.find("LandmarksPatient") is None
+    assert [a_logic.undoCheck() for _ in steps] == ["T 2 removed", "P1 removed", "T 1 removed"]
+    assert a_logic.undoCheckBlocked() == "nothing has been read"
+
+
 def test_points_go_to_the_list_that_is_chosen(a_logic):
     a_logic.connect()
     a_logic.parameters().change(points=PointList.PLAUSIBILITY, tool=Tool.STYLUS)
