@@ -61,6 +61,16 @@ def amode(
     tcp: Tcp = False,
     port: Port = 0,
     protocol: Annotated[str, typer.Option(metavar="serial|pic0rick", help="which device's language it speaks")] = "serial",
+    rate: Annotated[
+        float, typer.Option(metavar="HZ", min=0.1, max=1000, help="lines a second; a pic0rick fires on request")
+    ] = 20,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="of faults and virtual patient")] = 0,
 ) -> None:
-    """An A-mode pulser/receiver. The first line on stdout is the port to open."""
-    emulate_amode.run(replay, fault, protocol, port=port, pty=not tcp)
+    """An A-mode pulser/receiver. The first line on stdout is the port to open; it is served until Ctrl-C.
+
+    Without a recording it gives the lines of a probe on the virtual patient.
+
+    Faults, each NAME or NAME=SHARE of the answers: byte-loss, bit-errors, stall, disconnect, stale-fragment; of a pic0rick also
+    split-prompts, extra-prompts, adc-timeout, bang-jitter, pulser-off.
+    """
+    emulate_amode.run(replay, fault, protocol, port=port, pty=not tcp, rate_hz=rate, seed=seed)

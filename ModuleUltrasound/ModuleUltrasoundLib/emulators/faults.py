@@ -49,7 +49,9 @@ class Faults:
             try:
                 self.rates[name] = float(rate) if rate else DEFAULT_RATES[name]
             except ValueError:
-                raise InputError(f"fault {name}: expected a rate from 0 to 1 after =, got {rate!r}") from None
+                self.rates[name] = float("nan")
+            if not 0 <= self.rates[name] <= 1:
+                raise InputError(f"fault {name}: expected a rate from 0 to 1 after =, got {rate!r}")
 
     def strikes(self, name: str) -> bool:
         """Whether the fault happens now."""

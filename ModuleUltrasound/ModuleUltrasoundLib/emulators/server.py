@@ -156,7 +156,7 @@ def serve(device: EmulatedDevice, door: Door, stopped: Callable[[], bool]) -> No
         if not connected:
             if not door.wait_for_peer(0.1):
                 continue
-            connected = _send(door, device.greet())
+            connected = _send(door, device.greet(), stopped)
             continue
         data = door.receive(TICK_S)
         if data is None:
@@ -164,12 +164,14 @@ def serve(device: EmulatedDevice, door: Door, stopped: Callable[[], bool]) -> No
             connected = False
             continue
         chunks = device.receive(data, time.monotonic()) if data else []
-        connected = _send(door, chunks + device.tick(time.monotonic()))
+        connected = _send(door, chunks + device.tick(time.monotonic()), stopped)
 
 
-def _send(door: Door, chunks: list[Chunk]) -> bool:
-    """Send chunks in turn; False if one of them pulls the cable."""
+def _send(door: Door, chunks: list[Chunk], stopped: Callable[[], bool]) -> bool:
+    """Send chunks in turn, until stopped; False if one of them pulls the cable."""
     for chunk in chunks:
+        if stopped():  # an answer that nobody reads any more takes half a second a chunk
+            break
         if chunk.wait_s:
             time.sleep(chunk.wait_s)
         if chunk.hang_up:

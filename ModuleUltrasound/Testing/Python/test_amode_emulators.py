@@ -7,9 +7,11 @@ import sys
 
 import numpy as np
 import pytest
+from CranioNavLib.errors import InputError
 from CranioNavLib.sequence_metafile import Acquisition, Recording, write_recording
 from ModuleUltrasoundLib.devices.device import AMODE_DEVICES
-from ModuleUltrasoundLib.emulators.faults import DEFAULT_RATES, Faults
+from ModuleUltrasoundLib.emulators.faults import DEFAULT_RATES, Chunk, Faults
+from ModuleUltrasoundLib.emulators.server import TcpDoor, serve
 
 
 def recorded(lines: np.ndarray, acquisition: Acquisition) -> Recording:
@@ -63,6 +65,32 @@ def test_faults_strike_at_the_rate_that_is_asked_for():
     assert struck / 4000 == pytest.approx(0.25, abs=0.03)
     assert faults.struck == {"stall": struck}
     assert not any(faults.strikes("disconnect") for _ in range(100))
+
+
+@pytest.mark.parametrize("rate", ["1.5", "-0.1", "nan", "often"])
+def test_a_rate_that_is_no_share_is_refused(rate):
+    with pytest.raises(InputError, match="fault stall: expected a rate from 0 to 1"):
+        Faults([f"stall={rate}"])
+
+
+def test_an_emulator_that_is_told_to_end_does_not_send_its_answer_to_the_end():
+    class Talker:
+        def greet(self):
+            return [Chunk(b"x")] * 1000
+
+    class Listener(TcpDoor):
+        heard = 0
+
+        def wait_for_peer(self, timeout_s):
+            return True
+
+        def send(self, data):
+            self.heard += 1
+
+    door = Listener()
+    serve(Talker(), door, lambda: door.heard >= 3)
+    door.close()
+    assert door.heard == 3
 
 
 @pytest.mark.slow
