@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from CranioNavLib.errors import InputError
-from CranioNavLib.files import written_whole
+from CranioNavLib.files import set_aside, written_whole
 from CranioNavLib.metafile_reader import is_transform
 from CranioNavLib.recording import Acquisition, Recording, pixels_beside
 from CranioNavLib.rigid import Array
@@ -204,6 +204,29 @@ def recover(path: str | Path) -> int:
         raise InputError(f"cannot write {target}: {error.strerror}; it still holds the recording, with {raw.name}") from None
     raw.unlink()
     return count
+
+
+def put_aside(path: str | Path) -> Optional[Path]:
+    """Make room for a recording: an earlier one is renamed (see `files.set_aside`), joined first if it was interrupted.
+
+    Returns its new path, None if there is none.
+
+    Raises
+    ------
+    InputError
+        The path is none of a recording, or the folder cannot be written to.
+    """
+    target = _checked_target(path)
+    raw = pixels_beside(target)
+    try:
+        if raw.is_file():
+            try:
+                recover(target)
+            except InputError:  # no whole frame, or pixels without their header: kept as they are
+                set_aside(raw)
+        return set_aside(target)
+    except OSError as error:
+        raise InputError(f"cannot write {target}: {error.strerror}; choose a folder that exists and is writable") from None
 
 
 def _is_whole(path: Path) -> bool:

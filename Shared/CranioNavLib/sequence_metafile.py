@@ -6,7 +6,16 @@ One RF line a frame (`DimSize = N 1 F`, MET_SHORT), with pose, status and time a
 from __future__ import annotations
 
 from CranioNavLib.metafile_reader import read_recording
-from CranioNavLib.metafile_writer import RecordingWriter, recover, write_recording
+from CranioNavLib.metafile_writer import RecordingWriter, put_aside, recover, write_recording
 from CranioNavLib.recording import Acquisition, Recording, pixels_beside
 
-__all__ = ["Acquisition", "Recording", "RecordingWriter", "pixels_beside", "read_recording", "recover", "write_recording"]
+__all__ = [
+    "Acquisition",
+    "Recording",
+    "RecordingWriter",
+    "pixels_beside",
+    "put_aside",
+    "read_recording",
+    "recover",
+    "write_recording",
+]

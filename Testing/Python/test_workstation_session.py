@@ -198,6 +198,20 @@ def test_a_second_ct_takes_the_place_of_the_first_in_the_folder(tmp_path):
     assert (tmp_path / "session.json").is_file()
 
 
+def test_a_ct_that_could_not_be_written_is_offered_again_and_nothing_counts_as_saved(tmp_path):
+    (tmp_path / "session").write_text("a file where the folder should be")
+    running = Workstation(tmp_path / "session")
+    scene_data.set_volume("CT", Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), "nothing"))
+    with pytest.raises(InputError, match="cannot write into"):
+        running.keep()
+    running.session.save("ct")
+    assert not running.session.is_saved
+    (tmp_path / "session").unlink()
+    running.keep()
+    assert running.session.is_saved
+    assert (tmp_path / "session" / "session.json").is_file()
+
+
 def test_of_a_patient_laid_on_the_table_before_nothing_stays(tmp_path):
     from types import SimpleNamespace
 

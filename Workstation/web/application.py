@@ -12,9 +12,9 @@ from typing import Any
 
 from CranioNavLib import host, scene
 from CranioNavLib.errors import InputError
-from CranioNavLib.files import set_aside
 from CranioNavLib.panel import Panel
 from CranioNavLib.panel_model import PanelModel
+from CranioNavLib.sequence_metafile import put_aside
 from trame.app import TrameApp
 from trame_slicer.app.logic import get_view_trame_id
 
@@ -84,7 +84,7 @@ class WorkstationApp(TrameApp):
         self.server.state.legend, self.server.state.cue, self.server.state.muted = None, {}, False
         self.server.state.tilt = self.tilt.next(None)
         self.server.state.live = drawings(self.logics[ULTRASOUND])
-        self.server.state.files, self.server.state.simulated = [], False
+        self.server.state.files, self.server.state.simulated, self.server.state.unsaved = [], False, ""
         self.files = FilesDialog(self.server, self.places, self._load_ct, self.runner.start)
         with built_once():
             self.page = Page(self.server, self.panels, self.layouts, PROCEDURE)
@@ -316,10 +316,26 @@ class WorkstationApp(TrameApp):
                 self.session.folder.mkdir(parents=True, exist_ok=True)
             volume = self.session.ct_to_write()
             if volume is not None:
-                self.runner.start(lambda: self.session.write_ct(volume), _raise_if_failed)
+                self.runner.start(lambda: self.session.write_ct(volume), self._ct_written)
             self.session.save(self.server.state.step)
+            if self.session.is_saved:
+                self._unsaved("")
         except (InputError, OSError) as error:
-            LOG.error("the session cannot be saved: %s", error)
+            self._unsaved(str(error))
+
+    def _ct_written(self, outcome: Any) -> None:
+        if isinstance(outcome, (InputError, OSError)):
+            self._unsaved(str(outcome))
+        else:
+            _raise_if_failed(outcome)
+
+    def _unsaved(self, reason: str) -> None:
+        """Tell every window that nothing of the session is kept on the disk, and why."""
+        said = self.places.shown(reason)
+        if said and said != self.server.state.unsaved:
+            LOG.error("the session cannot be saved: %s", reason)
+        with self.server.state as state:
+            state.unsaved = said
 
 
 def _raise_if_failed(outcome: Any) -> None:
@@ -346,7 +362,7 @@ def _modules(session: SessionFolder, logics: dict[str, Any], go_to: Any) -> list
                 device.disconnect()
         registration.forgetPatient()
         registration.takeCt(volume)
-        set_aside(ultrasound.parameters().read().recording_path or session.recording_path)
+        put_aside(ultrasound.parameters().read().recording_path or session.recording_path)
 
     hand = simulated_hand.SimulatedHandLogic(
         ultrasound.nextPoint,

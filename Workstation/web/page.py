@@ -59,6 +59,8 @@ html { overflow: hidden; }
 .v-toolbar__content { overflow-x: auto; overflow-y: hidden; }
 @media (max-width: 1000px) { .title { display: none; } }
 .part .v-input--density-compact { margin-top: 14px !important; }
+.unsaved { position: fixed; top: 48px; right: 0; left: 580px; z-index: 890; padding: 8px 16px; text-align: center;
+  background: #4a1a10; color: #ffb4a2; border-bottom: 2px solid #ff7b5c; }
 .part { border-top: 1px solid rgba(255, 255, 255, 0.12); padding-top: 12px; margin-top: 12px; }
 """
 
@@ -87,6 +89,8 @@ class Page:
                     client.ServerTemplate(name=(name,))
             with v3.VMain(style="height: 100vh;"), html.Div(classes="views"):
                 layouts.initialize_layout_grid(self.layout)
+            with html.Div(v_if="unsaved", classes="unsaved", raw_attrs=["data-unsaved", 'role="alert"']):
+                html.Div(f"✗ {words.UNSAVED} {{{{ unsaved }}}}", classes="text-body-1")
             draw_resuming(self.panels[SESSION].key)
             draw_link()
 

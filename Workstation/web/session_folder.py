@@ -63,6 +63,11 @@ class SessionFolder:
         self._state = ""
 
     @property
+    def is_saved(self) -> bool:
+        """Whether what was there at the last `save` is in the folder; a CT that cannot be written leaves it behind."""
+        return self._ct_pending is None
+
+    @property
     def recording_path(self) -> str:
         """Where palpation is recorded, and where `cranionav register` reads it: always the latest; earlier ones are set aside."""
         return str(self.folder / RECORDING)
@@ -76,14 +81,25 @@ class SessionFolder:
         return self._ct_pending
 
     def write_ct(self, volume: Any) -> None:
-        """Put the CT into the folder, unless another one has come since. The state of the one before goes first."""
+        """Put the CT into the folder, unless another one has come since. The state of the one before goes first.
+
+        Raises
+        ------
+        InputError
+            The folder cannot be written to; `ct_to_write` offers the CT again.
+        """
         from CranioNavLib.phantom.case_writer import write_volume
 
         with self._ct_lock:
             if volume is not self._ct_pending:
                 return
-            (self.folder / STATE_FILE).unlink(missing_ok=True)
-            write_volume(output_folder(self.folder) / "ct.nrrd", volume)
+            try:
+                folder = output_folder(self.folder)
+                (folder / STATE_FILE).unlink(missing_ok=True)
+                write_volume(folder / "ct.nrrd", volume)
+            except BaseException:
+                self._ct_image = None  # to be tried again
+                raise
             if volume is self._ct_pending:
                 self._ct_pending = None
 

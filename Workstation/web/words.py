@@ -13,6 +13,7 @@ DONE = "Done."
 NOW, SEE_BELOW = "Now: ", "see below"
 OPEN_FILE = "Open"
 RESUMING = "Bringing back the session …"
+UNSAVED = "The session is not being saved:"
 DETAILS, SETTINGS, CANCEL = "Details", "Settings", "Cancel"
 
 # Title bar and keys

@@ -140,8 +140,8 @@ class VerifyingSteps(RegisteringSteps):
         if off_mm <= limit_mm:
             return ""
         return (
-            f"{name} was measured {off_mm:.1f} mm off, above the limit of {limit_mm:g} mm: measure it again; if that does not help, "
-            "palpate more points and register again"
+            f"{name} was measured {off_mm:.1f} mm off, above the limit of {limit_mm:g} mm: measure it again; if that does not "
+            "help, palpate more points and register again"
         )
 
     def plausibility(self) -> Optional[Reading]:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, Optional
 
 import numpy as np
 from CranioNavLib import scene, scene_data
-from CranioNavLib.files import set_aside
 from CranioNavLib.module_logic import done_or
 from CranioNavLib.panel import Level, Reading, StepState, StepStatus, Task
 from CranioNavLib.rigid import Array, invert_rigid, transform_points
+from CranioNavLib.sequence_metafile import put_aside
 
 from ModuleUltrasoundLib.devices.line_stream import PosedLine
 from ModuleUltrasoundLib.logic.measuring import MeasureStep
@@ -63,7 +63,7 @@ class PalpationStep(SweepStep, MeasureStep):
         from ModuleUltrasoundLib.palpation.palpation import Palpation, Sweep
 
         path = self.parameters().read().recording_path
-        earlier = set_aside(path)
+        earlier = put_aside(path)
         assert self.latest is not None  # see startRecordingBlocked
         self.recorder = LineRecorder(path, self.latest.line, self.running.acquisition)
         self.measureAnew()

@@ -19,6 +19,7 @@ from CranioNavLib.sequence_metafile import (
     Recording,
     RecordingWriter,
     pixels_beside,
+    put_aside,
     read_recording,
     recover,
     write_recording,
@@ -260,6 +261,28 @@ def test_an_interrupted_recording_is_not_overwritten(tmp_path):
     writer.append(0.0, {"ProbeToReference": np.eye(4)}, line=np.zeros(4, dtype=np.int16))
     with pytest.raises(InputError, match="interrupted recording; recover or remove it"):
         RecordingWriter(tmp_path / "a.igs.mha")
+
+
+def test_room_is_made_for_a_recording_and_an_interrupted_one_is_joined_before_it_is_put_aside(tmp_path):
+    path = tmp_path / "a.igs.mha"
+    assert put_aside(path) is None
+    for number in (1, 2):
+        writer = RecordingWriter(path, 4, ACQUISITION)
+        writer.append(0.0, {"ProbeToReference": np.eye(4)}, line=np.full(4, number, dtype=np.int16))
+        aside = put_aside(path)  # its process was killed: never closed
+        assert aside == tmp_path / f"a-{number}.igs.mha"
+        assert read_recording(aside).lines.tolist() == [[number] * 4]
+    (tmp_path / "a.part.raw").write_bytes(b"pixels without a header")
+    assert put_aside(path) is None
+    RecordingWriter(path, 4, ACQUISITION).close()
+    assert (tmp_path / "a-1.part.raw").is_file(), "kept"
+
+
+def test_what_is_no_recording_is_not_put_aside_for_one(tmp_path):
+    (tmp_path / "photo.jpg").write_text("dear")
+    with pytest.raises(InputError, match="give a name with that ending"):
+        put_aside(tmp_path / "photo.jpg")
+    assert (tmp_path / "photo.jpg").is_file()
 
 
 def test_an_older_recording_is_safe_until_the_first_frame_of_the_new_one(tmp_path):
