@@ -70,6 +70,7 @@ class Pic0rick(LinkedDevice):
         self._sampling_hz = float("nan")
         self._code = shell.gain_code(self.settings.gain_db)
         self._sequence = 0
+        self._shots: list[tuple[float, shell.AlignedShot]] = []  # of the next line, with their times
         self._flights: deque[float] = deque(maxlen=FLIGHTS)
 
     @property
@@ -116,7 +117,7 @@ class Pic0rick(LinkedDevice):
         raise DeviceError(_not_a_shell(name, heard))
 
     def _begin(self) -> None:
-        return  # it fires only on request
+        self._shots = []  # nothing to switch on: it fires only on request
 
     def _end(self) -> None:
         return
@@ -149,6 +150,7 @@ class Pic0rick(LinkedDevice):
         self.link.drain(QUIET_S, 1.0)
 
     def _write_gain(self, code: int) -> None:
+        self._shots = []
         for _ in range(3):
             answer, _ = self._transact(f"write dac {code}", WRITE_S)
             if answer is not None and b"DAC writing ended" in answer:
@@ -163,20 +165,19 @@ class Pic0rick(LinkedDevice):
     # -- lines
 
     def _next_line(self, timeout_s: float) -> Optional[RfLine]:
-        """One line of `averaging` shots; the gain stays as it is within them."""
+        """One line of `averaging` shots of one gain; those of a line that is not done in time wait for the next call."""
         end = time.monotonic() + timeout_s
-        shots: list[shell.AlignedShot] = []
-        times = []
-        while len(shots) < self.settings.averaging:
+        while True:
+            shot_s, codes = self._shoot()
+            shot = None if codes is None else self._aligned(codes)
+            if shot is not None:
+                self._shots.append((shot_s, shot))
+            if len(self._shots) >= self.settings.averaging:
+                break
             if time.monotonic() >= end:
                 return None
-            shot_s, codes = self._shoot()
-            if codes is None:
-                continue
-            shot = self._aligned(codes)
-            if shot is not None:
-                shots.append(shot)
-                times.append(shot_s)
+        times, shots = [shot_s for shot_s, _ in self._shots], [shot for _, shot in self._shots]
+        self._shots = []
         self._sequence += 1
         line = RfLine(self._averaged(shots), float(np.mean(times)), self._sequence, any(s.clipped for s in shots), self.gain_db)
         if self.settings.auto_gain:

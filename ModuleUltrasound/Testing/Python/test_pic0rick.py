@@ -163,6 +163,12 @@ def test_averaging_lowers_the_noise_as_the_root_of_the_count():
     assert spread[1] / spread[9] == pytest.approx(3.0, rel=0.15)
 
 
+def test_shots_of_a_line_that_takes_longer_than_the_reader_waits_are_not_lost():
+    with served(a_board()) as port, AMODE_DEVICES.create("pic0rick", port=port, averaging="3") as device:
+        taken = [device.read(0.0) for _ in range(6)]  # a shot each
+    assert [line is not None for line in taken] == [False, False, True] * 2
+
+
 def test_gain_is_written_at_connect_and_between_lines_only():
     board = a_board()
     with served(board) as port, AMODE_DEVICES.create("pic0rick", port=port, gain_db="20", averaging="4") as device:
