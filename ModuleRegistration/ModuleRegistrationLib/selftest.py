@@ -28,9 +28,9 @@ class RegistrationSelfTest(ScenarioOnScene):
         self._touchPatient(patient)
         logic.registerLandmarks()
         assert status() == "landmarks"
-        self.delayDisplay(logic.registerSurface().run())
+        self.delayDisplay(str(logic.registerSurface().run()))
         assert status() in ("accepted", "warning")
-        self.delayDisplay(logic.verify().run())
+        self.delayDisplay(str(logic.verify().run()))
         errors = scene_data.get_table("TargetErrors")["TRE (mm)"]
         assert len(errors) == len(patient.markers_ras_mm)
         assert sum(errors) / len(errors) < self.LARGEST_MEAN_TRE_MM

@@ -65,6 +65,9 @@ class Reading:
     text: str
     level: Level = Level.PLAIN
 
+    def __str__(self) -> str:
+        return self.text
+
 
 @dataclass(frozen=True)
 class StepStatus:

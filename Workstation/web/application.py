@@ -321,11 +321,11 @@ class WorkstationApp(TrameApp):
             if self.session.is_saved:
                 self._unsaved("")
         except (InputError, OSError) as error:
-            self._unsaved(str(error))
+            self._unsaved(_reason(error))
 
     def _ct_written(self, outcome: Any) -> None:
         if isinstance(outcome, (InputError, OSError)):
-            self._unsaved(str(outcome))
+            self._unsaved(_reason(outcome))
         else:
             _raise_if_failed(outcome)
 
@@ -336,6 +336,10 @@ class WorkstationApp(TrameApp):
             LOG.error("the session cannot be saved: %s", reason)
         with self.server.state as state:
             state.unsaved = said
+
+
+def _reason(error: InputError | OSError) -> str:
+    return str(error) if isinstance(error, InputError) else f"{error.filename}: {error.strerror}"
 
 
 def _raise_if_failed(outcome: Any) -> None:

@@ -13,7 +13,7 @@ DONE = "Done."
 NOW, SEE_BELOW = "Now: ", "see below"
 OPEN_FILE = "Open"
 RESUMING = "Bringing back the session …"
-UNSAVED = "The session is not being saved:"
+UNSAVED = "Nothing is being saved; start the workstation with a folder that can be written to (--case):"
 DETAILS, SETTINGS, CANCEL = "Details", "Settings", "Cancel"
 
 # Title bar and keys

@@ -164,7 +164,7 @@ class RegisteringSteps(RegistrationStep):
         result: RegistrationResult,
         verdict: Verdict,
         predicted: Optional[PredictedTre],
-    ) -> str:
+    ) -> Reading:
         from ModuleRegistrationLib.result_tables import landmark_rows, residual_columns, surface_rows
 
         points, rows = problem.points, {**landmark_rows(landmarks), **surface_rows(result, verdict, predicted)}
@@ -182,7 +182,7 @@ class RegisteringSteps(RegistrationStep):
         if predicted is not None:
             mean, worst = predicted.mean_mm.mean(), predicted.p95_mm.max()
             error = f"error to expect at the targets {mean:.1f} mm (mean), {worst:.1f} mm at the worst (95%)"
-        return "; ".join([laid, error, *verdict.messages])
+        return Reading("; ".join([laid, error, *verdict.messages]), results.LEVELS[verdict.status])
 
     def surfaceResidual(self) -> Optional[Reading]:
         """RMS distance of the bone points to the surface."""

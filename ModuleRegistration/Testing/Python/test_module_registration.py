@@ -211,6 +211,7 @@ def test_a_target_measured_further_off_than_the_limit_is_named_and_no_good_news(
     said = a_patient.verify().run()
     reading, status = a_patient.measuredTre(), a_patient.verificationStatus()
     if off_mm:
+        assert str(said) == said.text, "as it is printed in a console"
         assert status.state is StepState.ATTENTION
         assert status.text.startswith("d was measured ")
         assert "above the limit of 2 mm: measure it again" in status.text
