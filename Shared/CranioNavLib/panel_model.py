@@ -31,6 +31,7 @@ from CranioNavLib.panel import (
     StepState,
     StepStatus,
     Task,
+    check_panel,
 )
 from CranioNavLib.parameter_node import ParameterNode
 from CranioNavLib.parameters import ParameterInfo, Parameters
@@ -64,9 +65,15 @@ class PanelModel:
         Has the methods that the panel names, and `parameters()`, which returns a ParameterNode.
     runner : Runner, optional
         For long work. Without one, an action returns when all is done.
+
+    Raises
+    ------
+    InputError
+        The panel names what the logic, the scene or the plugins do not have.
     """
 
     def __init__(self, panel: Panel, logic: Any, runner: Runner | None = None) -> None:
+        check_panel(panel, type(logic))
         self.panel, self.logic, self.runner = panel, logic, runner
         self.message = Message("", Level.PLAIN)
         self.errors: dict[str, str] = {}  # field name -> why the last edit was refused

@@ -20,12 +20,11 @@ class Pace(str, Enum):
     """When the next line comes."""
 
     TIMED = "timed"  # as recorded, or faster or slower by `speed`
-    FAST = "fast"  # as soon as it is asked for
-    STEP = "step"  # one line after each call of `step`
+    FAST = "fast"  # as soon as it is asked for: step by step, for a script
 
 
 class Replay(AModeDevice):
-    """The lines of a recording, in real time, faster, or step by step."""
+    """The lines of a recording, in real time, faster or slower, or as they are asked for."""
 
     name = "replay"
     title = "Plays an A-mode recording"
@@ -44,7 +43,6 @@ class Replay(AModeDevice):
         self._recording: Optional[Recording] = None
         self._running = False
         self._next = 0
-        self._steps = 0
         self._round_s = 0.0  # host time at which the recording's first line was due
 
     @property
@@ -65,16 +63,6 @@ class Replay(AModeDevice):
         """As recorded."""
         return self.recording.acquisition
 
-    @property
-    def position(self) -> int:
-        """Index of the frame that comes next; the number of frames at the end."""
-        return self._next
-
-    @property
-    def at_end(self) -> bool:
-        """Whether every line has been given."""
-        return self._next >= len(self.recording) and not self.settings.loop
-
     def open(self) -> None:
         """Read the recording."""
         if not self.settings.path:
@@ -86,16 +74,12 @@ class Replay(AModeDevice):
 
     def start(self) -> None:
         """Begin with the first line."""
-        self._next, self._steps = 0, 0
+        self._next = 0
         self._round_s = time.monotonic()
         self._running = self.recording is not None
 
-    def step(self, count: int = 1) -> None:
-        """Let `count` more lines out (pace=step)."""
-        self._steps += count
-
     def read(self, timeout_s: float = 1.0) -> Optional[RfLine]:
-        """The next line; None if it is not due in time, not let out, or the recording is at its end."""
+        """The next line; None if it is not due in time, or the recording is at its end."""
         if not self._running:
             raise DeviceError("the replay device is not started; start it before reading lines")
         if self._next >= len(self.recording):
@@ -110,10 +94,6 @@ class Replay(AModeDevice):
             time.sleep(max(0.0, min(wait, timeout_s)))
             if wait > timeout_s:
                 return None
-        elif self.settings.pace is Pace.STEP:
-            if self._steps <= 0:
-                return None
-            self._steps -= 1
         samples = self.recording.lines[self._next]
         saturated = bool(samples.size and (samples.min() == INT16_ENDS[0] or samples.max() == INT16_ENDS[1]))
         self._next += 1

@@ -34,7 +34,6 @@ def test_every_line_comes_back_once_as_recorded(a_path):
         assert np.array_equal([line.samples for line in lines], recording.lines)
         assert [line.sequence_number for line in lines] == list(range(6))
         assert device.acquisition == recording.acquisition
-        assert device.at_end
         assert device.read(0.0) is None
 
 
@@ -53,17 +52,6 @@ def test_a_line_that_is_not_due_is_waited_for_only_as_long_as_allowed(a_path):
     with AMODE_DEVICES.create("replay", path=str(path), speed="0.01") as device:
         assert device.read(0.0) is not None
         assert device.read(0.01) is None
-        assert device.position == 1
-
-
-def test_stepwise_gives_one_line_a_step(a_path):
-    path, recording = a_path
-    with AMODE_DEVICES.create("replay", path=str(path), pace="step") as device:
-        assert device.read(0.0) is None
-        device.step(2)
-        assert np.array_equal(device.read().samples, recording.lines[0])
-        assert np.array_equal(device.read().samples, recording.lines[1])
-        assert device.read(0.0) is None
 
 
 def test_a_loop_begins_again_in_step_with_the_clock(a_path):

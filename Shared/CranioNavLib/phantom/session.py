@@ -180,23 +180,6 @@ class SimulatedSession:
         with self._lock:
             self._script = sorted([*self._script, *((now + delay, what) for delay, what in steps)], key=lambda step: step[0])
 
-    @property
-    def playing(self) -> bool:
-        """Whether things are still to be done by themselves."""
-        with self._lock:
-            return bool(self._script)
-
-    def palpate_plan(self, dwell_s: float = 3.0) -> float:
-        """Palpate all points of the plan one after another, by itself. Returns how long it will take, s."""
-
-        def visit(point: int) -> Callable[[], None]:
-            return lambda: self.hold_probe_at(point)
-
-        each = constants.MOVE_S + dwell_s
-        count = len(self._plan[0])
-        self.play([*((point * each, visit(point)) for point in range(count)), (count * each, lambda: self.put_away(PROBE))])
-        return count * each
-
     def sweep_plan(self) -> float:
         """Slide the probe over the skin through the points of the plan, the nearest next, and back. Returns how long it takes, s.
 

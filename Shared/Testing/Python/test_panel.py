@@ -32,7 +32,6 @@ from CranioNavLib.panel import (
     StepState,
     StepStatus,
     Task,
-    check_panel,
     label_of,
 )
 from CranioNavLib.panel_model import PanelModel
@@ -166,10 +165,6 @@ def item(name):
 # The description
 
 
-def test_a_right_description_passes():
-    check_panel(KITCHEN, KitchenLogic)
-
-
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
@@ -183,13 +178,13 @@ def test_a_right_description_passes():
 def test_a_description_that_names_what_is_not_there_is_refused(wrong, says):
     panel = Panel("Kitchen", "Kitchen", KitchenParameters, (Step("one", "One", "", (wrong,)),))
     with pytest.raises(InputError, match=says):
-        check_panel(panel, KitchenLogic)
+        PanelModel(panel, KitchenLogic())
 
 
 def test_a_name_given_twice_is_refused():
     panel = Panel("Kitchen", "", KitchenParameters, (Step("a", "A", "", (Action("cook", "1"), Action("cook", "2"))),))
     with pytest.raises(InputError, match="cook stands twice"):
-        check_panel(panel, KitchenLogic)
+        PanelModel(panel, KitchenLogic())
 
 
 def test_a_label_is_made_of_the_parameters_name_without_its_unit():
@@ -380,7 +375,7 @@ def test_choosing_in_a_list_is_kept_and_the_logic_hears_of_it():
 
 def test_a_list_without_its_method_is_refused():
     with pytest.raises(InputError, match="jars"):
-        check_panel(SHELF, KitchenLogic)
+        PanelModel(SHELF, KitchenLogic())
 
 
 def test_a_degree_sign_stands_close_to_its_number():

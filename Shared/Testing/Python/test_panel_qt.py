@@ -14,7 +14,7 @@ pytest.importorskip("PySide6.QtWidgets", exc_type=ImportError)
 
 from CranioNavLib import host, panel_qt_widgets, scene, scene_data
 from CranioNavLib.host import ScriptedLoadableModuleWidget
-from CranioNavLib.panel import Action, ListField, NodeField, Picture, ReadOut, StepState, check_panel
+from CranioNavLib.panel import Action, ListField, NodeField, Picture, ReadOut, StepState
 from CranioNavLib.panel_model import PanelModel
 from CranioNavLib.panel_qt import PanelWidget
 from CranioNavLib.slicer_files import LabelledPoints
@@ -65,7 +65,7 @@ def a_registration_panel(qt, an_empty_scene):
 @pytest.mark.parametrize("name", MODULES)
 def test_each_modules_description_names_only_what_its_logic_has(name):
     found = module(name)
-    check_panel(found.panel, found.logic)
+    PanelModel(found.panel, found.logic())
 
 
 def test_everything_described_is_drawn(a_drawn_panel):

@@ -117,14 +117,14 @@ def test_the_echo_comes_from_the_depth_at_which_the_probe_stands(a_session):
     assert hits >= 4
 
 
-def test_a_scripted_palpation_visits_every_point_and_puts_the_probe_away(a_session):
-    lasts = a_session.palpate_plan(dwell_s=1.0)
+def test_what_is_to_be_done_later_is_done_in_time_and_order(a_session):
+    a_session.play([(2.0, lambda: a_session.put_away("Probe")), (1.0, lambda: a_session.hold_probe_at(3))])
     visited = []
-    for moment in np.arange(0.0, lasts + 0.5, 0.1):
+    for moment in (0.5, 1.1, 2.1):
         a_session.clock.wait_until(moment)
         a_session.tool_to_reference("Probe", moment)
         visited.append(a_session.palpation_point)
-    assert list(dict.fromkeys(visited)) == [0, 1, 2, 3, 4, -1]
+    assert visited == [-1, 3, -1]
 
 
 def test_a_sweep_slides_over_every_point_of_the_plan_at_its_pace_and_with_the_skin(a_session, a_patient):
