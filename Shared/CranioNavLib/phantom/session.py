@@ -180,6 +180,12 @@ class SimulatedSession:
         with self._lock:
             self._script = sorted([*self._script, *((now + delay, what) for delay, what in steps)], key=lambda step: step[0])
 
+    @property
+    def playing(self) -> bool:
+        """Whether things are still to be done by themselves."""
+        with self._lock:
+            return bool(self._script)
+
     def sweep_plan(self) -> float:
         """Slide the probe over the skin through the points of the plan, the nearest next, and back. Returns how long it takes, s.
 
