@@ -11,8 +11,10 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.panel import Level, Reading, StepStatus
 from CranioNavLib.rigid import Array
 
+from ModuleUltrasoundLib.devices.device import AModeDevice
 from ModuleUltrasoundLib.devices.line_batches import LineBatch, LineBatches
 from ModuleUltrasoundLib.devices.line_stream import LinePoser, LineStream, PosedLine
+from ModuleUltrasoundLib.devices.linked_device import LinkedDevice
 from ModuleUltrasoundLib.logic.planning import ProtocolStep, registered
 
 if TYPE_CHECKING:
@@ -35,6 +37,7 @@ class ProbeStep(ProtocolStep):
         self._batches = LineBatches()
         self._waiting: list[LineBatch] = []  # to be measured
         self._shown: Optional[PosedLine] = None  # the last line measured
+        self._gain_db: Optional[float] = None  # as last set on the device
         self._guide: Optional[Guide] = None  # where the probe stands to the current point
         self._surface: tuple[int, Optional[Surface]] = (0, None)  # time stamp of the mesh; its index is worth keeping
 
@@ -42,6 +45,7 @@ class ProbeStep(ProtocolStep):
         """Begin to take lines from the device that the parameters name. Returns a message."""
         device = self.createPlugin("amode", self.parameters().read().device)
         self.failure, self.poser = "", LinePoser()
+        self._gain_db = getattr(device.settings, "gain_db", None)
         self._observation = scene.observe("ProbeToReference", self._takePose)
         self.stream = LineStream(device)
         self.stream.start()
@@ -102,10 +106,18 @@ class ProbeStep(ProtocolStep):
             lines += lines_of(self.measured, [item.line.host_time_s for item in batch.lines])[-batch.new :]
             self._shown = batch.lines[-1]
         if self._shown is not None and batches:
+            self._followGain(self.running.device)
             samples = self._shown.line.samples
             times = 1e6 / self.running.acquisition.sampling_hz * np.arange(len(samples))
             scene_data.set_table("ALine", {"time (µs)": times.tolist(), "amplitude": samples.tolist()})
         return lines
+
+    def _followGain(self, device: AModeDevice) -> None:
+        """A gain that the user changes while the device runs is set on it; all else counts from the next connection."""
+        gain_db = getattr(self.pluginSettings("amode", device.name).read(), "gain_db", None)
+        if isinstance(device, LinkedDevice) and gain_db is not None and gain_db != self._gain_db:
+            device.set_gain_db(gain_db)
+            self._gain_db = gain_db
 
     def steer(self) -> None:
         """Where the probe stands to the bone it has to see, under the registration in force."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Optional
 
 import numpy as np
@@ -91,6 +91,7 @@ class SerialDevice(LinkedDevice):
 
     def _apply_gain(self, gain_db: float) -> None:
         self._in_force = self._settings_in(self._ask(f"SET gain_db={gain_db:g}"))
+        self.settings = replace(self.settings, gain_db=gain_db)  # also when the device comes back
         self._lines.clear()  # those still waiting were taken with the old gain
 
     def _next_line(self, timeout_s: float) -> Optional[RfLine]:

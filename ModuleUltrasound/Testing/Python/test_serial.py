@@ -67,6 +67,9 @@ def test_gain_changes_the_lines_and_is_told():
     with served(a_pulser()) as port, AMODE_DEVICES.create("serial", port=port, range_us="30") as device:
         device.set_gain_db(36.0)
         line = lines_of(device, 1)[0]
+        device.close()
+        with device:  # as after a pulled cable
+            assert lines_of(device, 1)[0].gain_db == 36.0
     recorded = a_recording().lines[(line.sequence_number - 1) % 12].astype(float)
     assert line.gain_db == 36.0
     assert np.allclose(line.samples, recorded * 10 ** (6 / 20), atol=0.51)
