@@ -14,7 +14,7 @@ from Workstation.web import words
 from Workstation.web.drawings_view import STYLE as DRAWINGS_STYLE
 from Workstation.web.drawings_view import draw_live
 from Workstation.web.keyboard import draw_help
-from Workstation.web.panel_view import PanelView
+from Workstation.web.panel_view import PanelView, pressed
 from Workstation.web.procedure import DEVICES, HAND, SESSION, ProcedureStep
 from Workstation.web.session_files_view import draw_files
 from Workstation.web.session_link import draw_link
@@ -145,7 +145,7 @@ class Page:
 
     def _draw_what_next(self, step: ProcedureStep, before: tuple[ProcedureStep, ...], after: ProcedureStep | None) -> None:
         """What to do now with the one button for it, what was said of it, and the way on, which is never locked."""
-        done, busy = f"{self._state_of(step)} === 'done'", " || ".join(f"{key}.busy" for key in self._keys(step))
+        done, busy = f"{self._state_of(step)} === 'done'", self._busy(step)
         with v3.VAlert(
             variant="tonal",
             density="compact",
@@ -227,8 +227,14 @@ class Page:
     def _part(self, module: str, name: str) -> Step:
         return next(part for part in self.panels[module].model.panel.steps if part.name == name)
 
-    def _keys(self, step: ProcedureStep) -> list[str]:
-        return [self.panels[module].key for module in dict.fromkeys(module for module, _ in step.parts)]
+    def _busy(self, step: ProcedureStep) -> str:
+        """A JavaScript expression: whether something runs that this step has begun; the page goes on in another one."""
+        begun = []
+        for module in dict.fromkeys(module for module, _ in step.parts):
+            key = self.panels[module].key
+            names = [item for one, name in step.parts if one == module for item in pressed(self._part(module, name))]
+            begun.append(f"({key}.busy && {names!r}.includes({key}.last))")
+        return " || ".join(begun)
 
     def _statuses(self, step: ProcedureStep, hand: bool = False) -> list[str]:
         """JavaScript of the status of each part that has one; the simulated hand's do not make a step done."""

@@ -78,7 +78,7 @@ class PanelView:
 
     def _is_over(self, state: dict[str, Any]) -> bool:
         """Whether the message tells of what was to be done ("pivot for 10 s") and it has been done since."""
-        owner = next((step for step in self.model.panel.steps if self._last in _pressed(step)), None)
+        owner = next((step for step in self.model.panel.steps if self._last in pressed(step)), None)
         now = state["status"][owner.name]["state"] if owner is not None else ""
         if self._said[0] != state["message"]["text"]:
             self._said = (state["message"]["text"], now)
@@ -244,7 +244,7 @@ class PanelView:
 
     def draw_said(self, steps: list[Step]) -> None:
         """What is running and what was last said, of an action of these steps."""
-        mine = f"{[name for step in steps for name in _pressed(step)]!r}.includes({self.key}.last)"
+        mine = f"{[name for step in steps for name in pressed(step)]!r}.includes({self.key}.last)"
         with html.Div(v_if=f"{self.key}.busy && {mine}", classes="mt-2"):
             html.Div(f"{{{{ {self.key}.busy.text || {self.key}.busy.label }}}} …", classes="text-body-2")
             v3.VProgressLinear(
@@ -302,7 +302,7 @@ class PanelView:
         return next(item for item in fields if item.name == name)
 
 
-def _pressed(step: Step) -> list[str]:
+def pressed(step: Step) -> list[str]:
     """What can be pressed or picked in a step."""
     return [item.name for item in step.items if isinstance(item, (Action, ListField))]
 

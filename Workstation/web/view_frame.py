@@ -21,7 +21,7 @@ STYLE = """
 .over { position: absolute; pointer-events: none; color: #e8eef2; text-shadow: 0 0 4px #000, 0 0 2px #000; font-size: 18px; }
 .over-name { left: 8px; top: 4px; font-size: 15px; opacity: 0.85; }
 .slice-slider * { transition: none !important; }
-.legend { left: 12px; bottom: 10px; width: 240px; font-size: 15px; }
+.legend { left: 12px; bottom: 10px; width: min(240px, 100% - 24px); font-size: 15px; }
 .legend-bar { height: 12px; border: 1px solid #90a4ae; }
 """
 LEGEND = """

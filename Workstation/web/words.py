@@ -48,7 +48,7 @@ SIDES = {  # left, right, top and bottom of a slice as radiology shows it
     "Coronal": ("R", "L", "S", "I"),
     "Sagittal": ("A", "P", "S", "I"),
 }
-EXPECTED_ERROR, WITH_POINTS = "Expected error, 95 %", "expected with the {count} points taken"
+EXPECTED_ERROR, WITH_POINTS = "Expected error, 95 %", "expected with the points taken: {count}"
 BONE_POINTS, LEFT_OUT = "Bone points: distance to the bone", "crosses: {count} left out"
 SCALE_END = "≥ {most:g} mm"
 PICTURE_OLD = "picture {seconds} s old"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Optional, Union
 import numpy as np
 from CranioNavLib import scene, scene_data
 from CranioNavLib.files import output_folder
-from CranioNavLib.module_logic import done_or
+from CranioNavLib.module_logic import done_or, todo
 from CranioNavLib.panel import Level, Progress, Reading, StepState, StepStatus, Task
 from CranioNavLib.slicer_files import save_scene, write_transform
 
@@ -172,6 +172,12 @@ class VerifyingSteps(RegisteringSteps):
             return StepStatus(StepState.ATTENTION, "; ".join(doubts))
         if names.TRE_MEAN in rows and self._tooFarOff():
             return StepStatus(StepState.ATTENTION, self._tooFarOff(), "verify")
+        if (
+            not lacking(*MARKERS)
+            and names.BELOW_LIMIT in rows
+            and set(_measured()) != set(pairs("TargetsPatient", "TargetsCT")[2])
+        ):
+            return todo("other markers have been read since: verify again")
         verified = any(name in rows for name in (names.TRE_MEAN, names.PLAUSIBILITY_MAX, names.HELD_OUT, names.BELOW_LIMIT))
         return done_or(verified, self.verifyBlocked() or "verify the registration")
 

@@ -222,6 +222,18 @@ def test_a_target_measured_further_off_than_the_limit_is_named_and_no_good_news(
         assert reading.text.startswith("one marker: ") == (count == 1)
 
 
+def test_markers_read_after_the_registration_was_verified_ask_for_it_again(a_patient):
+    markers = scene_data.get_points("TargetsPatient")
+    scene.release("TargetsPatient")
+    a_patient.registerSurface().run()
+    a_patient.verify().run()
+    assert a_patient.verificationStatus().state is StepState.DONE
+    scene_data.set_points("TargetsPatient", markers)
+    assert a_patient.verificationStatus().text == "other markers have been read since: verify again"
+    a_patient.verify().run()
+    assert a_patient.verificationStatus().state is StepState.DONE
+
+
 def test_a_new_registration_forgets_what_was_measured_of_the_old_one(a_patient):
     a_patient.registerLandmarks()
     a_patient.registerSurface().run()
