@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Optional
 
 from CranioNavLib.errors import InputError
+from CranioNavLib.files import write_text
 from CranioNavLib.slicer_files import LabelledPoints, read_points
 
 # name of a thing in case.json -> the file names it may have in the folder
@@ -23,6 +24,7 @@ FILES = {
     "targets-patient": ("targets-patient.mrk.json", "targets-patient.fcsv"),
     "plausibility": ("plausibility.mrk.json", "plausibility.fcsv"),
 }
+NOTE = "note"  # name in case.json of a sentence for the report
 LONGEST_PATH = 256  # a longer text under an unknown name is a note; systems refuse to look for a file of such a name
 REQUIRED = ("ct", "landmarks-ct", "landmarks-patient")
 MODES = ("Ia", "Ib", "IIa", "IIb", "III")
@@ -41,6 +43,7 @@ class Case:
     targets_ct: Optional[LabelledPoints] = None
     targets_patient: Optional[LabelledPoints] = None
     plausibility: Optional[LabelledPoints] = None
+    note: str = ""  # what the report has to say of it first: that the patient is a simulated one
 
     @property
     def name(self) -> str:
@@ -82,7 +85,7 @@ def find_files(folder: Path) -> dict[str, Path]:
     """
     if not folder.is_dir():
         raise InputError(f"no case folder {folder}; give a folder that holds a CT and the landmark lists")
-    redirected = _read_redirections(folder)
+    redirected = _redirections(folder, _read_json(folder))
     found: dict[str, Path] = {}
     for thing, names in FILES.items():
         if thing in redirected:
@@ -105,16 +108,21 @@ def find_files(folder: Path) -> dict[str, Path]:
     return found
 
 
-def _read_redirections(folder: Path) -> dict[str, str]:
+def _read_json(folder: Path) -> dict[str, object]:
     path = folder / "case.json"
     if not path.exists():
         return {}
     try:
-        redirected = json.loads(path.read_text(encoding="utf-8"))
+        redirected: object = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f'cannot read {path}: {error}; expected JSON such as {{"ct": "../ct.nrrd"}}') from None
     if not isinstance(redirected, dict):
         raise InputError(f'{path} must hold one JSON object such as {{"ct": "../ct.nrrd"}}')
+    return redirected
+
+
+def _redirections(folder: Path, redirected: dict[str, object]) -> dict[str, str]:
+    path = folder / "case.json"
     # a name may be given as the thing ("ct") or as the file it stands for ("landmarks-ct.mrk.json")
     by_name = {name: thing for thing, names in FILES.items() for name in (thing, *names)}
     known = {by_name[key]: value for key, value in redirected.items() if key in by_name}
@@ -123,7 +131,14 @@ def _read_redirections(folder: Path) -> dict[str, str]:
     for thing, value in known.items():
         if not isinstance(value, str):
             raise InputError(f"{path}: {thing} must be a path in quotes, got {value!r}")
-    return known
+    return {thing: str(value) for thing, value in known.items()}
+
+
+def note_in_case(folder: Path, changes: Mapping[str, str]) -> None:
+    """Set names in the folder's case.json; what else stands there stays."""
+    known = _read_json(folder)
+    if {**known, **changes} != known:
+        write_text(folder / "case.json", json.dumps({**known, **changes}, indent=1) + "\n")
 
 
 def _check_no_redirection(path: Path, key: str, value: object, names: Iterable[str]) -> None:
@@ -151,4 +166,5 @@ def read_case(folder: str | Path) -> Case:
         for thing, path in files.items()
         if thing not in ("ct", "palpation")
     }  # fmt: skip
-    return Case(folder=folder, ct=files["ct"], palpation=files.get("palpation"), **lists)
+    note = _read_json(folder).get(NOTE, "")
+    return Case(folder=folder, ct=files["ct"], palpation=files.get("palpation"), note=str(note), **lists)

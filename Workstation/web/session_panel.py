@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from CranioNavLib import scene, scene_data
+from CranioNavLib.case import NOTE, note_in_case
 from CranioNavLib.errors import InputError
 from CranioNavLib.module_logic import ParametersInScene
 from CranioNavLib.panel import Action, Level, Panel, Progress, Reading, ReadOut, Step, StepState, StepStatus, Task, words_of
@@ -23,6 +24,7 @@ from Workstation.web.session_folder import SessionFolder, last_session
 
 OFFERED = ("report.html", "report.pdf", "scene.mrb", "ReferenceToRas.tfm", "registration.json")  # what the page lets one open
 USUAL_REPORT_S = 15.0  # the bar stands at half then
+SIMULATED = "Simulated patient, tracker and probe"
 SAME_MM = 0.05  # between the registration on the screen and the one that the report repeats from the files
 
 
@@ -152,11 +154,13 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         if not recording.is_file():
             raise InputError("there is no recording of a palpation; the report is written of an ultrasound registration")
 
+        says = {} if self.session.simulated_seed is None else {NOTE: f"{SIMULATED}, seed {self.session.simulated_seed}"}
+        if recording.name != "palpation.igs.mha" or recording.parent != folder:
+            says["palpation"] = str(recording)
+
         def write(progress: Progress) -> float:
             progress("registering the saved session and drawing the report", 0.0)
-            if recording.name != "palpation.igs.mha" or recording.parent != folder:
-                redirection = json.dumps({"palpation": str(recording)})
-                (folder / "case.json").write_text(redirection, encoding="utf-8")
+            note_in_case(folder, says)
             command = [sys.executable, "-m", "Workstation", "register", str(folder), "-o", str(folder), "--mode", "III"]
             command += ["--method", wanted.method, "--segmentation", wanted.segmentation]
             root = Path(__file__).resolve().parents[2]

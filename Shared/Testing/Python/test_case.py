@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
-from CranioNavLib.case import find_files
+from CranioNavLib.case import find_files, note_in_case, read_case
 from CranioNavLib.errors import InputError
+from CranioNavLib.slicer_files import LabelledPoints, write_points
 
 
 @pytest.fixture
@@ -38,3 +40,14 @@ def test_notes_of_another_kind_may_stand_beside_the_names(a_folder):
     found = find_files(a_folder)
     assert set(found) == {"ct", "landmarks-ct", "landmarks-patient", "points"}
     assert found["points"].resolve() == (a_folder.parent / "elsewhere.mrk.json").resolve()
+
+
+def test_a_note_for_the_report_is_kept_beside_what_stands_in_case_json(a_folder):
+    for name in ("landmarks-ct", "landmarks-patient"):
+        write_points(a_folder / f"{name}.mrk.json", LabelledPoints(("a",), np.zeros((1, 3))), name)
+    assert read_case(a_folder).note == ""
+    (a_folder / "case.json").write_text(json.dumps({"surgeon": "M."}))
+    note_in_case(a_folder, {"note": "Simulated patient"})
+    note_in_case(a_folder, {})
+    assert read_case(a_folder).note == "Simulated patient"
+    assert json.loads((a_folder / "case.json").read_text()) == {"surgeon": "M.", "note": "Simulated patient"}
