@@ -45,7 +45,8 @@ LARGEST_ROUGHNESS_MM = 0.45  # RMS from the plane through the bone under the bod
 SMALLEST_SPACING_MM = 20.0
 NASION_CHORD_MM = 14  # half the chord over the dip between brow and nose
 NASION_DIP_MM = 2.0  # its least depth below that chord
-FACE_DEPTH_MM = 60.0  # from the foremost bone to the nasion, at most
+PROFILE_STEP_MM = 4.0  # between the profiles in which it is looked for
+FACE_DEPTH_MM = 40.0  # from the foremost bone to the nasion, at most
 LARGEST_PROFILE_STEP_MM = 5.0  # a longer step is the rim of a hole
 ADULT_LENGTH_MM = 178.0  # nasion to opisthocranion, where the CT does not reach the back of the head
 NORMAL_SD_MM = 0.6  # of a bone point along the surface normal: one value for all, only ratios matter here
@@ -190,7 +191,7 @@ def _frame_from_shape(surface: Surface) -> Array:
     middle_x = (low[0] + high[0]) / 2
     heights = np.arange(high[2] - 45.0, max(low[2], high[2] - 150.0), -1.0)
     found = []
-    for x in middle_x + np.arange(-24.0, 25.0, 4.0):  # a head that leans has its nose beside the middle
+    for x in middle_x + np.arange(-36.0, 37.0, PROFILE_STEP_MM):  # a head that leans has its nose beside the middle
         origins = np.column_stack([np.full(len(heights), x), np.full(len(heights), high[1] + 50.0), heights])
         profile = high[1] + 50.0 - surface.cast(origins, np.array([0.0, -1.0, 0.0])).distances_mm
         profile[profile < high[1] - FACE_DEPTH_MM] = np.nan  # seen through a hole: the far side
@@ -200,9 +201,21 @@ def _frame_from_shape(surface: Surface) -> Array:
     if not found:  # no face: where an adult's would be
         return rigid(np.eye(3), [middle_x, high[1] - 8.0, high[2] - 100.0])
     places = np.array(found)
-    middle = np.sort(places[:, 2])[len(places) // 2]  # one of them, not between two that differ
-    agreeing = places[np.abs(places[:, 2] - middle) < NASION_CHORD_MM]
+    top = _shared_top(places)
+    agreeing = places[(places[:, 2] <= top) & (places[:, 2] > top - NASION_CHORD_MM)]
     return rigid(np.eye(3), agreeing[np.argmax(agreeing[:, 1])])  # beside the nose the bone lies further back
+
+
+def _shared_top(places: Array) -> float:
+    """Height of the uppermost dip (x, y, z) that a neighbouring profile has, too; else of the middle one of all.
+
+    Of a real skull's profiles most miss the root of the nose and find a dip under the orbit.
+    """
+    for top in places[np.argsort(-places[:, 2])]:
+        beside = np.abs(np.abs(places[:, 0] - top[0]) - PROFILE_STEP_MM) < PROFILE_STEP_MM / 2
+        if (np.abs(places[beside, 2] - top[2]) < NASION_CHORD_MM).any():
+            return float(top[2])
+    return float(np.sort(places[:, 2])[len(places) // 2])  # one of them, not between two that differ
 
 
 def _first_dip(profile: Array) -> Optional[int]:

@@ -174,6 +174,16 @@ def test_a_probe_cannot_stand_at_an_edge_or_on_a_step():
     assert normals[0] == pytest.approx([0.0, 0.0, 1.0], abs=1e-4)
 
 
+def test_the_nasion_is_the_uppermost_dip_that_neighbours_share_though_more_are_under_the_orbits(a_skull, monkeypatch):
+    seen = [95, None, 90, 92, 53, 52, 48, 47, None, 87, 85, 93, None]  # as on a real skull: 4 mm steps from its right to its left
+    dips = iter([20, None, None, *seen, None, None, None])  # and a lone one higher up, of a hole's rim
+    monkeypatch.setattr("ModuleUltrasoundLib.palpation.protocol._first_dip", lambda profile: next(dips))
+    origin = plan_protocol(a_skull).head_to_ras[:3, 3]
+    top = a_skull.vertices_mm[:, 2].max() - 45.0
+    assert 46.0 < top - origin[2] < 54.0
+    assert abs(origin[0]) < 10.0
+
+
 def test_two_dips_that_disagree_still_give_a_nasion(a_skull, monkeypatch):
     dips = iter([30, None, 80] + [None] * 50)
     monkeypatch.setattr("ModuleUltrasoundLib.palpation.protocol._first_dip", lambda profile: next(dips))
