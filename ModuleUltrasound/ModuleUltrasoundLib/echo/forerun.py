@@ -44,6 +44,7 @@ class Forerun:
     found: npt.NDArray[np.bool_]  # (n,) the echo was seen in this line
     measured: npt.NDArray[np.bool_]  # (n,) the time comes from this line's echo or its neighbours', not from the header
     sd_s: Array  # (n,) of the skin's time, as far as noise makes it uncertain
+    face: Array  # (n,) highest envelope where the face should be, of whatever it is an echo; 0 without a forerun
 
 
 def nominal_skin_s(acquisition: Acquisition) -> float:
@@ -63,7 +64,8 @@ def find_forerun(envelopes: Envelopes, magnitude: npt.NDArray[np.float32], noise
     nominal = nominal_skin_s(acquisition)
     count, length = magnitude.shape
     false = np.zeros(count, dtype=bool)
-    nothing = Forerun(np.full(count, nominal), np.zeros(count), false, false, np.zeros(count))
+    none = np.zeros(count)
+    nothing = Forerun(np.full(count, nominal), none, false, false, none, none)
     rate = envelopes.rate_hz
     first = max(int((nominal * (1 - SEARCH) - SEARCH_S / 2) * rate), 1)
     last = min(int((nominal * (1 + SEARCH) + SEARCH_S) * rate) + 1, length - 1)
@@ -79,6 +81,7 @@ def find_forerun(envelopes: Envelopes, magnitude: npt.NDArray[np.float32], noise
     guard = int(PULSE_CYCLES / acquisition.transducer_hz * rate)
     index = np.minimum(samples[:, 0] + (guard + np.arange(0, int(BEHIND_S * rate), 2))[:, None], length - 1)
     behind = np.exp(np.log(at_samples(magnitude, index) + 1e-3).mean(axis=0))
+    nothing = replace(nothing, face=heights)
     times = positions / rate
     expected = (times > nominal - 0.3 / acquisition.transducer_hz) & (times < nominal + 1.5 / acquisition.transducer_hz)
     inside = (samples[:, 0] > first) & (samples[:, 0] < last - 1)
@@ -91,7 +94,7 @@ def find_forerun(envelopes: Envelopes, magnitude: npt.NDArray[np.float32], noise
         return nothing
     middle = median(times[found])
     sd = np.where(found, widths / rate * noise / np.maximum(heights, 1e-9), SAME_S / 2)
-    return Forerun(np.where(found, times, middle), np.where(found, heights, 0.0), found, ~false, sd)
+    return Forerun(np.where(found, times, middle), np.where(found, heights, 0.0), found, ~false, sd, heights)
 
 
 def steady(forerun: Forerun) -> Forerun:

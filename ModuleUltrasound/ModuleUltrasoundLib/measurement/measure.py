@@ -11,6 +11,7 @@ from CranioNavLib.parameters import Limits, Parameters
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Recording
 
+from ModuleUltrasoundLib.echo.features import NAMES
 from ModuleUltrasoundLib.echo.lean import median, without_nan
 from ModuleUltrasoundLib.echo.likelihood import SHARED_NAMES, judge_echoes
 from ModuleUltrasoundLib.echo.network import Likelihood, learnt
@@ -24,6 +25,7 @@ from ModuleUltrasoundLib.measurement.quality import (
     TOLERANCE_MM,
     choose,
     clipped_share,
+    lost_contact,
     quality_of,
     reasons_of,
     unstable,
@@ -168,6 +170,9 @@ def assemble(
     )
     times = found.candidates.delays_s[rows, best] + found.forerun.skin_s
     clipped = clipped_share(recording, times) > CLIPPED_SHARE
+    multiple = found.features[rows, best, NAMES.index("multiple")]
+    lifted = lost_contact(found.forerun.face, multiple, quality >= settings.quality_gate)
+    quality = np.where(lifted, 0.0, quality)
     good = quality >= settings.quality_gate
     reasons = reasons_of(
         recording,
@@ -180,6 +185,7 @@ def assemble(
         15 * shared[rows, best, SHARED_NAMES.index("strength")],
         10 * shared[:, 0, SHARED_NAMES.index("contact")],
         chance[rows, best],
+        lifted,
     )
     other = (np.abs(found.depths_mm - depth[:, None]) >= TOLERANCE_MM) & (chance >= LEAST_ALTERNATIVE)
     return LineMeasurements(

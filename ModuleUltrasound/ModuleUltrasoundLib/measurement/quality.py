@@ -8,7 +8,8 @@ import scipy
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Recording
 
-from ModuleUltrasoundLib.echo.lean import clip, pick, without_nan
+from ModuleUltrasoundLib.echo.features import REPEATED
+from ModuleUltrasoundLib.echo.lean import clip, median, pick, without_nan
 
 Bools = npt.NDArray[np.bool_]
 
@@ -17,6 +18,10 @@ GROUP_SHARE = 0.9  # groups nearly as likely as the likeliest one compete by the
 CLIPPED_SHARE = 0.15  # of an echo's samples at the converter's end: beyond, its shape is lost
 QUIET_DB = 14.0  # the strongest of a line's candidates is below this over the noise: nothing is seen in it
 STRONG_FORERUN_DB = 5.0  # over the recording's median: nothing takes sound out of the forerun
+# The forerun's face sends all back in air, and 0.05 to 0.3 of it with skin and gel behind: 10 to 26 dB less
+IN_AIR_DB = 12.0  # of the face's echo over that of the lines that see bone
+LIFTED_DB = 4.0  # the same, where the echo lies where the face's echo would repeat
+LEAST_IN_CONTACT = 3  # lines
 TILTED_DB = 9.0  # a bone echo weaker than this under the recording's others: a tilt of several degrees
 LIKELY = 0.3
 UNSTABLE_MM = 1.0  # off the neighbours' median along the beam, while the probe rests
@@ -98,6 +103,19 @@ def unstable(recording: Recording, depth_mm: Array, good: Bools, runs: npt.NDArr
     return np.asarray(good & enough & (near >= AGREEING * found) & (np.abs(middle) > UNSTABLE_MM))
 
 
+def lost_contact(face: Array, multiple: Array, good: Bools) -> Bools:
+    """Frames (n,) whose forerun ends in air: its face's echo (`face`, level) is far above that of the frames that see bone.
+
+    No sound gets into the head then, and an echo is the face's own, once more: `multiple` (n,) says how well the chosen echo
+    lies where that would be. The rule needs no forerun echo in contact, where a well matched forerun shows none.
+    """
+    known = good & (multiple < REPEATED) & (face > 0)
+    if known.sum() < LEAST_IN_CONTACT:
+        return np.zeros(len(face), dtype=bool)
+    over_db = 20 * np.log10(np.maximum(face, 1e-9) / median(face[known]))
+    return np.asarray((over_db > IN_AIR_DB) | ((over_db > LIFTED_DB) & (multiple > REPEATED)))
+
+
 def reasons_of(
     recording: Recording,
     quality: Array,
@@ -109,6 +127,7 @@ def reasons_of(
     strength_db: Array,
     forerun_db: Array,
     likely: Array,
+    lifted: Bools,
 ) -> tuple[str, ...]:
     """Why each frame is not a point; empty for those that are. The first that applies of the list below."""
     status = {one: np.array([other == one for other in recording.statuses], dtype=bool) for one in set(recording.statuses)}
@@ -121,6 +140,7 @@ def reasons_of(
         ("pose missing", status.get("MISSING", none) | (fine & ~has_pose)),
         ("pose out of view", status.get("OUT_OF_VIEW", none) | status.get("OUT_OF_VOLUME", none)),
         ("pose invalid", ~fine),
+        ("no contact", lifted),
         ("saturated", clipped),
         ("unstable", shaky),
         ("", good),

@@ -25,7 +25,7 @@ def candidates_at(depths_mm, snrs_db, **others):
 
 def features_of(candidates, forerun_amplitude=1000.0):
     seen = np.array([forerun_amplitude > 0])
-    forerun = Forerun(np.array([SKIN_S]), np.array([forerun_amplitude]), seen, seen, np.zeros(1))
+    forerun = Forerun(np.array([SKIN_S]), np.array([forerun_amplitude]), seen, seen, np.zeros(1), np.zeros(1))
     values = line_features(candidates, forerun, SKIN_S, 5e6, SPEED)
     return {name: values[0, :, number] for number, name in enumerate(NAMES)}
 

@@ -24,7 +24,18 @@ def onset_pulse(time_s, centre_hz):
 
 
 def record(
-    rng, depths_mm, acquisition, snr_db=30.0, wave=pulse, samples=3200, galea=0.12, warm=0.0, contact=None, bone=None, points=None
+    rng,
+    depths_mm,
+    acquisition,
+    snr_db=30.0,
+    wave=pulse,
+    samples=3200,
+    galea=0.12,
+    warm=0.0,
+    contact=None,
+    bone=None,
+    points=None,
+    matched=0.2,
 ):
     """Lines of plain textbook pulse-echo: forerun face, galea, speckle down to the bone, bone, inner table, noise."""
     count = len(depths_mm)
@@ -45,7 +56,7 @@ def record(
     for index, depth in enumerate(depths_mm):
         line = lines[index]
         if skin:
-            face = -0.2 if contact[index] else -1.0
+            face = -matched if contact[index] else -1.0
             for bounce in (1, 2, 3):
                 add(line, bounce * skin, face**bounce * 0.4 ** (bounce - 1))
         if contact[index]:
@@ -108,6 +119,20 @@ def test_probe_in_air_and_tissue_without_bone_give_no_points():
     assert not lines.accepted[kind == 1].any()
     assert lines.accepted[kind == 2].mean() > 0.9
     assert "no contact" in {lines.reasons[index] for index in np.flatnonzero(kind == 0)}
+
+
+def test_second_echo_of_a_face_in_air_is_no_bone_where_a_matched_face_shows_none_in_contact():
+    """It lies where the neighbours see bone, and is as strong: only that the face's own echo is there at all tells it."""
+    rng = np.random.default_rng(5)
+    acquisition = SET_UPS["5 MHz, polystyrene"]
+    again_mm = acquisition.forerun_length_mm / acquisition.forerun_speed_m_s * SPEED
+    contact = np.arange(60) % 10 < 7
+    depths = np.where(np.arange(60) < 30, again_mm + 0.25, 8.0) + rng.normal(0, 0.03, 60)
+    recording = record(rng, depths, acquisition, contact=contact, points=np.arange(60) // 10, matched=0.01)
+    found = measure_lines(recording, EchoSettings(speed_of_sound_m_s=SPEED))
+    assert not found.accepted[~contact].any()
+    assert {found.reasons[index] for index in np.flatnonzero(~contact)} == {"no contact"}
+    assert found.accepted[contact].mean() > 0.9
 
 
 def test_depth_scales_with_the_speed_of_sound():

@@ -2,7 +2,15 @@ import numpy as np
 import pytest
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition, Recording
-from ModuleUltrasoundLib.measurement.quality import choose, clipped_share, converter_limits, quality_of, reasons_of, unstable
+from ModuleUltrasoundLib.measurement.quality import (
+    choose,
+    clipped_share,
+    converter_limits,
+    lost_contact,
+    quality_of,
+    reasons_of,
+    unstable,
+)
 
 
 def a_recording(count=20, lines=None, statuses=None):
@@ -55,7 +63,7 @@ def test_pressing_is_no_instability():
 def reasons(**values):
     given = {
         "quality": 0.2, "clipped": False, "shaky": False, "depth_mm": 6.0, "line_snr_db": 30.0, "strength_db": 0.0,
-        "forerun_db": 0.0, "likely": 0.5, "status": "OK", **values,
+        "forerun_db": 0.0, "likely": 0.5, "lifted": False, "status": "OK", **values,
     }  # fmt: skip
     one = {name: np.array([value]) for name, value in given.items() if name != "status"}
     return reasons_of(a_recording(1, statuses=(given["status"],)), gate=0.8, **one)[0]
@@ -69,6 +77,7 @@ def reasons(**values):
         ({"quality": 0.9, "status": "OUT_OF_VIEW"}, "pose out of view"),
         ({"quality": 0.9, "status": "REQ_TIMEOUT"}, "pose invalid"),
         ({"quality": 0.9, "clipped": True}, "saturated"),
+        ({"quality": 0.0, "clipped": True, "lifted": True}, "no contact"),
         ({"quality": 0.9, "shaky": True}, "unstable"),
         ({"forerun_db": 12.0}, "no contact"),
         ({"strength_db": -15.0}, "tilt too large"),
@@ -79,6 +88,14 @@ def reasons(**values):
 )
 def test_each_refusal_has_its_reason(values, reason):
     assert reasons(**values) == reason
+
+
+def test_face_far_above_that_of_the_lines_with_bone_is_in_air():
+    face, good = np.array([1.0, 1.1, 0.9, 5.0, 2.0, 2.0]), np.array([True, True, True, True, True, False])
+    again = np.array([0.0, 0.0, 0.0, 0.0, 0.9, 0.1])
+    assert lost_contact(face, again, good).tolist() == [False, False, False, True, True, False]
+    assert not lost_contact(face, again, np.zeros(6, dtype=bool)).any(), "nobody knows how strong it is in contact"
+    assert not lost_contact(np.zeros(6), again, good).any(), "there is no forerun"
 
 
 def test_echoes_side_by_side_count_together_when_the_bone_is_chosen():
