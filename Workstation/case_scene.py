@@ -24,7 +24,8 @@ def fill_scene(result: CaseResult) -> None:
     host.scene().Clear(False)
     scene_data.set_volume("CT", result.volume)
     scene_data.set_surface("Bone", result.bone.closed)
-    scene_data.set_surface("OuterTable", result.bone.outer_table)
+    table = scene_data.set_surface("OuterTable", result.bone.outer_table)
+    table.GetDisplayNode().SetVisibility(False)  # it lies on Bone: drawn with it, both flicker
     refused = result.verdict.status == "refused"
     registration = scene_data.set_transform("ReferenceToRas", np.eye(4) if refused else result.registration.reference_to_ras)
     if not refused:

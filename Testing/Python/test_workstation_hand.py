@@ -47,3 +47,15 @@ def test_the_hand_glides_to_and_fro_while_a_sweep_is_recorded_and_no_longer(a_se
     recording[0] = False
     hand.poll()
     assert a_session.tool_to_reference(PROBE, 5.0) is None
+
+
+def test_without_a_registration_the_hand_is_asked_for_no_targets(monkeypatch):
+    host.scene().Clear(False)
+    monkeypatch.setattr(simulated_hand, "running_simulation", lambda: object())
+    hand = SimulatedHandLogic(lambda: None, lambda: None, lambda: False, lambda volume: None)
+    for registered, state in ((False, StepState.DONE), (True, StepState.TODO)):
+        if registered:
+            scene_data.set_transform("ReferenceToRas", np.eye(4)).SetAttribute("CranioNav.Status", "accepted")
+        assert hand.targetHandStatus().state is state
+        assert hand.tourHandStatus().state is state
+    host.scene().Clear(False)

@@ -223,8 +223,9 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
     def reportStatus(self) -> StepStatus:
         """Whether the report is of the registration in force."""
-        if not self.session.report_of:
-            return StepStatus(StepState.TODO, self.writeReportBlocked() or "write the report")
+        blocked = self.writeReportBlocked()
+        if blocked or not self.session.report_of:
+            return StepStatus(StepState.TODO, blocked or "write the report")
         if self.session.report_of != json.dumps(scene_data.get_transform("ReferenceToRas").tolist()):
             return StepStatus(StepState.ATTENTION, "the registration has changed; write the report again")
         return StepStatus(StepState.DONE)

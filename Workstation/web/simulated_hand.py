@@ -269,12 +269,12 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         """Whether the targets are measured."""
         node = scene.find("TargetsPatient")
         measured = node is not None and node.GetNumberOfControlPoints() > 0
-        return done_or(running_simulation() is None or measured, "let the simulated hand measure the targets")
+        return done_or(running_simulation() is None or measured or not _registered(), "let the simulated hand measure the targets")
 
     def tourHandStatus(self) -> StepStatus:
         """Whether the stylus is being led about."""
         touring = self._does[0] == "tour" and time.monotonic() < self._does[2]
-        return done_or(running_simulation() is None or touring, "let the simulated hand visit the targets")
+        return done_or(running_simulation() is None or touring or not _registered(), "let the simulated hand visit the targets")
 
     def _session(self) -> Any:
         session = running_simulation()
@@ -292,6 +292,12 @@ def _waiting_landmarks() -> list[str]:
             [node.GetNthControlPointLabel(i) for i in range(node.GetNumberOfControlPoints())] if node is not None else []
         )
     return [label for label in labels[0] if label not in labels[1]]
+
+
+def _registered() -> bool:
+    """Whether there is a registration: without one there is nothing to verify or to navigate by."""
+    node = scene.find("ReferenceToRas")
+    return node is not None and bool(node.GetAttribute(scene.STATUS_ATTRIBUTE))
 
 
 def running_simulation() -> Any:
