@@ -212,6 +212,20 @@ def test_a_ct_that_could_not_be_written_is_offered_again_and_nothing_counts_as_s
     assert (tmp_path / "session" / "session.json").is_file()
 
 
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_of_a_session_that_is_not_gone_on_with_nothing_is_taken_for_the_next_patient(tmp_path, goes_on):
+    for name in ("session.json", "landmarks-patient.mrk.json", "targets-patient.mrk.json", "palpation.igs.mha"):
+        (tmp_path / name).write_text("of the one before")
+    running = Workstation(tmp_path)
+    running.session.goes_on = goes_on
+    scene_data.set_volume("CT", Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), "nothing"))
+    running.keep()
+    for name in ("landmarks-patient", "targets-patient", "palpation"):
+        kept = sorted(path.name for path in tmp_path.glob(f"{name}*"))
+        assert [one.startswith(f"{name}-1.") for one in kept] == [not goes_on], kept
+    assert json.loads((tmp_path / "session.json").read_text())["step"] == "ct"
+
+
 def test_of_a_patient_laid_on_the_table_before_nothing_stays(tmp_path):
     from types import SimpleNamespace
 

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from CranioNavLib import host, scene, scene_data
 from CranioNavLib.errors import InputError
-from CranioNavLib.files import output_folder, write_text
+from CranioNavLib.files import output_folder, set_aside, write_text
+from CranioNavLib.sequence_metafile import put_aside
 from CranioNavLib.slicer_files import LabelledPoints, read_points, write_points
 
 STATE_FILE = "session.json"
@@ -55,6 +56,7 @@ class SessionFolder:
     def __init__(self, folder: Path, parameter_nodes: Callable[[], Iterable[Any]]) -> None:
         self.folder, self._parameter_nodes = Path(folder), parameter_nodes
         self.simulated_seed: int | None = None
+        self.goes_on = False  # whether what the folder holds is this session's own
         self.report_of = ""  # the registration that the report in the folder is of
         self._written: dict[str, str] = {}
         self._ct_image: Any = None  # of the CT that is, or is being, written
@@ -77,8 +79,18 @@ class SessionFolder:
         node = scene.find("CT")
         if node is None or node.GetImageData() is None or node.GetImageData() is self._ct_image:
             return None
+        if self._ct_image is None and not self.goes_on:
+            self._put_earlier_aside()
         self._ct_image, self._ct_pending, self._state = node.GetImageData(), scene_data.get_volume("CT"), ""
         return self._ct_pending
+
+    def _put_earlier_aside(self) -> None:
+        """What an earlier session left in the folder, where another one is begun there: it is of another patient."""
+        if not (self.folder / STATE_FILE).is_file():
+            return
+        put_aside(self.folder / RECORDING)
+        for name in (*LISTS.values(), "case.json", STATE_FILE):
+            set_aside(self.folder / name)
 
     def write_ct(self, volume: Any) -> None:
         """Put the CT into the folder, unless another one has come since. The state of the one before goes first.

@@ -269,7 +269,9 @@ class SimulatedHandLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         """Whether the targets are measured."""
         node = scene.find("TargetsPatient")
         measured = node is not None and node.GetNumberOfControlPoints() > 0
-        return done_or(running_simulation() is None or measured or not _registered(), "let the simulated hand measure the targets")
+        return done_or(
+            running_simulation() is None or measured or not _registered(), "let the simulated hand measure the targets"
+        )
 
     def tourHandStatus(self) -> StepStatus:
         """Whether the stylus is being led about."""
