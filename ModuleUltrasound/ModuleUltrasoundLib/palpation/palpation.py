@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from ModuleUltrasoundLib.measurement.measure import LineMeasurements
 
 NEAR = "near a point already kept"
+USUAL_LINES = 6  # that tell how often lines come
+MISSED = 2.5  # times the usual way from line to line: one bad line between two good ones is no gap
+SLOWEST_S = 2.0  # without a good line, however slow the device
 POSE_NOISE_MM = 2.0  # between two poses of a probe at rest: a poor tracker has 0.35 mm an axis, that is 0.86 mm RMS
 
 
@@ -29,7 +32,9 @@ class PalpationSettings(Parameters):
     dwell_s: Annotated[float, Limits(0.1, 5), "stable and good for so long: taken"] = 0.5
     least_quality: Annotated[float, Limits(0, 1), "quality of every line that counts"] = 0.85
     stable_mm: Annotated[float, Limits(0.1, 10), "the bone point stays within this of its middle"] = 1.0
-    longest_gap_s: Annotated[float, Limits(0.02, 2), "without a good line: the dwell begins anew"] = 0.25
+    longest_gap_s: Annotated[
+        float, Limits(0.02, 2), "without a good line: the dwell begins anew; a slow device may take longer"
+    ] = 0.25
     least_lines: Annotated[int, Limits(1, 100), "good lines in a dwell"] = 4
     target_radius_mm: Annotated[float, Limits(1, 100), "from the target, under the registration in force"] = 15.0
     apart_mm: Annotated[float, Limits(0, 50), "from every point taken before"] = 6.0
@@ -102,6 +107,7 @@ class Palpation:
         self.refused: Counter[str] = Counter()  # lines that did not count, by reason
         self._taken: list[TakenPoint] = []
         self._dwell: deque[PalpationLine] = deque()
+        self._times: deque[float] = deque(maxlen=USUAL_LINES)  # of the last lines, good or not
         self._target: Optional[int] = 0
         self._target_mm: Optional[Array] = None
 
@@ -152,14 +158,13 @@ class Palpation:
         """Take the next line."""
         if self._target is None:
             return self._status("every point is taken")
+        self._times.append(line.time_s)
+        if self._dwell and line.time_s - self._dwell[-1].time_s > self._longest_gap_s():
+            self._dwell.clear()
         reason = self._why_refused(line)
         if reason:
             self.refused[reason] += 1
-            if self._dwell and line.time_s - self._dwell[-1].time_s > self.settings.longest_gap_s:
-                self._dwell.clear()
             return self._status(reason)
-        if self._dwell and line.time_s - self._dwell[-1].time_s > self.settings.longest_gap_s:
-            self._dwell.clear()
         self._dwell.append(line)
         self._drop_what_moved()
         if self._dwelt_s() < self.settings.dwell_s or len(self._dwell) < self.settings.least_lines:
@@ -167,6 +172,11 @@ class Palpation:
         point = self._take(self._target)
         self._advance()
         return self._status("", point)
+
+    def _longest_gap_s(self) -> float:
+        """A board that sends three lines a second has no gaps because of that."""
+        usual_s = float(np.median(np.diff(self._times))) if len(self._times) > 1 else 0.0
+        return max(self.settings.longest_gap_s, min(MISSED * usual_s, SLOWEST_S))
 
     def _why_refused(self, line: PalpationLine) -> str:
         if not line.accepted:

@@ -102,6 +102,19 @@ def test_a_gap_begins_the_dwell_anew():
     assert states[0].dwell == 0.0
 
 
+@pytest.mark.parametrize("interval_s", [0.025, 0.3, 0.8])
+def test_a_slow_devices_lines_are_no_gaps(interval_s):
+    palpation = Palpation(LABELS)
+    taken = [k for k in range(40) if palpation.add(a_line(10 + k * interval_s)).new_point]
+    assert taken == [max(3, round(0.5 / interval_s))]
+    fresh = Palpation(LABELS)
+    for k in range(3):
+        fresh.add(a_line(k * interval_s))
+    for k in range(20):  # the echo is lost for a while
+        fresh.add(a_line((3 + k) * interval_s, accepted=False, reason="no echo"))
+    assert fresh.add(a_line(23 * interval_s)).dwell == 0.0
+
+
 def test_single_bad_lines_do_not_break_a_dwell():
     palpation = Palpation(LABELS)
     for k in range(11):
