@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib import scene, scene_data, slice_views
 from CranioNavLib.errors import InputError
-from CranioNavLib.module_logic import todo
 from CranioNavLib.panel import Entry, Level, Progress, Reading, StepState, StepStatus, Task
 from CranioNavLib.point_editor import PointEditor
 from CranioNavLib.rigid import Array, transform_points
@@ -52,7 +51,7 @@ class PlanningStep(RegistrationStep):
         def take(found: LandmarkSuggestions) -> str:
             self.planned.remember()
             scene_data.set_points("LandmarksCT", LabelledPoints(tuple(found.labels), found.positions_ras_mm))
-            return f"{', '.join(found.labels)}: suggested; check each in the views and move it where needed. {found.note}"
+            return f"{', '.join(found.labels)}: suggested. {found.note}"
 
         return Task("Suggest landmarks", suggest, of_this_ct(take))
 
@@ -169,7 +168,10 @@ class PlanningStep(RegistrationStep):
         """Whether there are enough landmarks to register by, and whether each lies where such a landmark can lie."""
         placed = sum(one.done for one in self.planned.entries())
         if placed < LEAST_LANDMARKS:
-            return todo(lacking_ct() or f"place {LEAST_LANDMARKS - placed} more landmarks")
+            missing = lacking_ct() or f"place {LEAST_LANDMARKS - placed} more landmarks"
+            return StepStatus(StepState.TODO, missing, "" if placed else "suggestLandmarks")
+        if self.planned.said and self.planned.active():
+            return StepStatus(StepState.ATTENTION, self.planned.said)
         if self._exchangeable():
             first, second = self._exchangeable()
             said = f"{first} and {second} lie on each other's side: exchange them, or place them again"

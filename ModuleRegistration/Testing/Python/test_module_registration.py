@@ -305,7 +305,8 @@ def test_landmarks_are_planned_without_a_mouse_and_each_step_is_taken_back(a_bal
     from CranioNavLib import slice_views
 
     logic = a_ball_in_air
-    assert logic.planStatus().state is StepState.TODO
+    first = logic.planStatus()
+    assert (first.state, first.action) == (StepState.TODO, "suggestLandmarks")
     for number in range(3):
         monkeypatch.setattr(slice_views, "crossing", lambda number=number: np.array([5.0, 10 * number, 20]))
         logic.placeHere()
@@ -313,6 +314,10 @@ def test_landmarks_are_planned_without_a_mouse_and_each_step_is_taken_back(a_bal
     assert planned.labels == tuple(one.name for one in logic.landmarks())[:3]
     np.testing.assert_allclose(planned.positions_mm[:, 1], [0, 10, 20])
     assert logic.planStatus().state is StepState.DONE
+    monkeypatch.setattr(logic.planned, "active", lambda: planned.labels[0])
+    logic.planned.said = "the click missed the head"
+    assert logic.planStatus().state is StepState.ATTENTION, "placed before, but the click since did nothing"
+    monkeypatch.undo()
     logic.undoLandmark()
     assert len(scene_data.get_points("LandmarksCT")) == 2
     assert "place 1 more" in logic.planStatus().text
