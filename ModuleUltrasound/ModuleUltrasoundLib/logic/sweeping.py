@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING, Any, Optional
 
 from CranioNavLib import scene_data
-from CranioNavLib.panel import Reading
+from CranioNavLib.panel import Level, Reading
 from CranioNavLib.rigid import Array
 
 from ModuleUltrasoundLib.logic.asking import AskStep
@@ -39,6 +39,11 @@ class SweepStep(AskStep):
             return super().aimAt(probe_to_ras, surface)
         near = surface.closest(probe_to_ras[None, :3, 3])
         return near.points_mm[0], near.normals[0]
+
+    def guidance(self) -> Optional[Reading]:
+        """What to do with the probe now: a gliding one is not told to hold still."""
+        found = super().guidance()
+        return Reading("glide on", Level.GOOD) if self.sweep is not None and found and found.level is Level.GOOD else found
 
     def sweepOver(self, lines: list[PalpationLine]) -> None:
         """Take measured lines; the points are shown about once a second."""

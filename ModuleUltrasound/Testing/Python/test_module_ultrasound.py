@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -342,6 +343,8 @@ def test_a_gliding_probe_leaves_points_on_its_way_and_asks_for_none(a_recording_
     assert logic.guidance() is not None  # where it is, it only has to stand upright
     assert logic.palpationStatus().state is StepState.ATTENTION
     assert "points of the sweep" in logic.dwell().text
+    logic._guide = SimpleNamespace(instruction="hold still", on_target=True, aligned=True)
+    assert logic.guidance().text == "glide on"
     logic.showSweep()
     along = np.sort(scene_data.get_bone_points().positions_mm @ start[:3, 0])
     assert np.diff(along).min() > 1.8  # one every 2 mm at most, and fewer where the machine was busy
