@@ -10,8 +10,8 @@ from ModuleUltrasoundLib.devices.line_stream import PosedLine
 # A fifth of a second, which is how often a panel shows the depth. No usual line rate has a line at its very end, where
 # rounding of times would decide.
 BATCH_S = 0.1995
-# Lines before a batch that it is measured with. The detector looks back over 20; of simulated sweeps it accepts 39, 49, 55 and
-# 55 % of the lines with 4, 12, 24 and 96 before them.
+# Lines before a batch that it is measured with, as far as the detector looks back. Of simulated sweeps it accepts a quarter
+# fewer lines with 4 of them, and no more with 96.
 CONTEXT_LINES = 24
 
 
