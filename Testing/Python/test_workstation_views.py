@@ -207,7 +207,7 @@ def test_the_expected_error_is_drawn_where_it_is_and_shrinks_with_points(an_empt
     assert drawn[far > 150].min() > drawn[far < 20].max()
     before = drawn.copy()
     scene_data.set_points("SurfacePoints", LabelledPoints(("a", "b", "c"), vertices[:: len(vertices) // 3][:3]))
-    assert "3 points" in views.refresh(copy.node, error_views.MAP)["note"]
+    assert "taken: 3" in views.refresh(copy.node, error_views.MAP)["note"]
     after = vtk_to_numpy(mesh.GetPointData().GetArray(error_views.ERROR))
     assert (after <= before + 1e-6).all()
     assert after.mean() < 0.95 * before.mean()
