@@ -30,6 +30,7 @@ BLUR_STEP = 64  # bins: maps are of many sizes, matrices for them of a few
 USUAL_MM = 1.2  # the scalp of a head is about as thick from place to place
 SURE = 0.85
 LEAST_FOR_SHARED = 3  # lines with a likely bone before anything is learnt from the recording
+STRETCH, AROUND = 112, 8  # lines of a glide judged together, and lines on each side that are looked at with them
 
 
 Real = TypeVar("Real", bound="np.floating[Any]")
@@ -65,8 +66,22 @@ SHARED_NAMES = (
 def judge_echoes(found: Found, likelihood: Likelihood, runs: npt.NDArray[np.int64]) -> tuple[Array, Array]:
     """Probability (n, K) of each candidate to be the bone, and the last turn's shared features (n, K, len(SHARED_NAMES)).
 
-    `found` holds the scores of the likelihood's first network.
+    `found` holds the scores of the likelihood's first network. A long glide is judged stretch by stretch: where the hand was
+    tilted for half of the way says nothing about the other half, and the live sweep, which comes in batches, is judged alike.
     """
+    count = len(runs)
+    if count <= STRETCH + 2 * AROUND or (runs[-1] - runs[0]) * (STRETCH + 2 * AROUND) > count:
+        return _judge_together(found, likelihood, runs)
+    parts = []
+    for first in range(0, count, STRETCH):
+        begin, end = max(first - AROUND, 0), min(first + STRETCH + AROUND, count)
+        own = slice(first - begin, first - begin + STRETCH if first + STRETCH < count else None)
+        parts.append([values[own] for values in _judge_together(found.part(begin, end), likelihood, runs[begin:end])])
+    chance, shared = (np.concatenate(values) for values in zip(*parts))
+    return chance, shared
+
+
+def _judge_together(found: Found, likelihood: Likelihood, runs: npt.NDArray[np.int64]) -> tuple[Array, Array]:
     scores, echoes = found.scores, Echoes.of(found.depths_mm, runs)
     shared = shared_features(found, scores, runs, echoes)
     for turn, network in enumerate(likelihood.networks[1:]):

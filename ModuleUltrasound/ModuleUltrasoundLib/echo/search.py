@@ -40,6 +40,20 @@ class Found:
     rate_hz: float
     carrier_hz: float
 
+    def part(self, first: int, last: int) -> Found:
+        """Lines [first, last) alone."""
+        rows = slice(first, last)
+        return replace(
+            self,
+            candidates=Candidates(**{name: getattr(self.candidates, name)[rows] for name in Candidates.__dataclass_fields__}),
+            forerun=Forerun(**{name: getattr(self.forerun, name)[rows] for name in Forerun.__dataclass_fields__}),
+            forerun_phases=self.forerun_phases[rows],
+            features=self.features[rows],
+            scores=self.scores[rows],
+            depths_mm=self.depths_mm[rows],
+            windows=self.windows[rows],
+        )
+
 
 def check_length(recording: Recording, speed_m_s: float, least_depth_mm: float) -> None:
     """Refuse a recording whose lines end before any bone could be seen.

@@ -6,6 +6,7 @@ import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition, Recording
+from ModuleUltrasoundLib.echo import likelihood
 from ModuleUltrasoundLib.echo.network import learnt
 from ModuleUltrasoundLib.measurement.measure import EchoSettings, measure_lines, several_spots, stays
 
@@ -283,3 +284,17 @@ def test_lines_are_measured_on_one_thread_and_leave_the_other_cores_alone():
     measure_lines(recording)
     own, all_threads = time.thread_time() - own, time.process_time() - all_threads
     assert all_threads < 1.3 * own
+
+
+def test_what_lies_far_along_a_glide_says_nothing_about_a_line(monkeypatch):
+    monkeypatch.setattr(likelihood, "STRETCH", 24)
+    monkeypatch.setattr(likelihood, "AROUND", 4)
+    rng, set_up, count, near = np.random.default_rng(12), SET_UPS["5 MHz, polystyrene"], 90, 24
+    depths, one_spot = np.full(count, 7.0), np.zeros(count, dtype=int)
+    glide = rigid_from_vector(np.zeros((count, 3)), np.arange(count)[:, None] * np.array([0.5, 0, 0]))
+    bone, no_bone = (record(rng, depths, set_up, snr_db=14.0, bone=one_spot == where, points=one_spot) for where in (0, 1))
+    seen = replace(bone, probe_to_reference=glide, palpation_points=one_spot - 1)
+    lost = replace(seen, lines=np.where(np.arange(count)[:, None] < 2 * near, seen.lines, no_bone.lines))
+    first, second = (measure_lines(one, EchoSettings(speed_of_sound_m_s=SPEED)) for one in (seen, lost))
+    np.testing.assert_allclose(first.qualities[:near], second.qualities[:near], atol=1e-9)
+    assert second.qualities[-near:].max() < 0.5 < first.qualities[-near:].min()
