@@ -1,7 +1,8 @@
-"""What the tests of anatomy stand on: shells whose edge is known, DICOM folders, the sample head."""
+"""What the tests stand on: shells whose edge is known, DICOM folders, the sample head, a touched patient."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,9 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.volume import Volume
 from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian, generate_uid
+
+sys.path.insert(0, str(Path(__file__).parent))
+from touched_patient import a_logic, a_patient, a_skull  # noqa: F401 (fixtures)
 
 CT_CLASS = "1.2.840.10008.5.1.4.1.1.2"
 
