@@ -13,8 +13,10 @@ from ModuleUltrasoundLib.measurement.measure import several_spots, stays
 LINES = 64  # that are looked at
 LEAST_LINES = 8
 BANG_S = 2e-6  # of a line belong to the main bang
+LEAST_PLACES = 4  # the same interface may happen to lie equally deep at two or three
 STEADY = 0.95  # mean resultant length: an echo of the probe itself stands still while the tissue under it changes
 LEAST_SNR = 20.0
+RISE_S, LEAST_RISE = 1e-6, 2.0  # an echo stands out of what comes before it, the main bang's tail does not
 
 
 def forerun_remark(recording: Recording) -> str:
@@ -30,7 +32,10 @@ def forerun_remark(recording: Recording) -> str:
     acquisition = recording.acquisition
     check_acquisition(acquisition)
     nominal = nominal_skin_s(acquisition)
-    if nominal == 0.0 or len(recording) < LEAST_LINES or not several_spots(recording, stays(recording)):
+    runs = stays(recording)
+    if nominal == 0.0 or len(recording) < LEAST_LINES or not several_spots(recording, runs):
+        return ""
+    if 1 < len(np.unique(runs)) < LEAST_PLACES:
         return ""
     lines = recording.lines[:: max(len(recording) // LINES, 1)]
     envelopes = complex_envelopes(lines, design_band(acquisition, lines.shape[1], lines.shape[1] / acquisition.sampling_hz))
@@ -42,6 +47,8 @@ def forerun_remark(recording: Recording) -> str:
     time_s = np.arange(len(mean)) / envelopes.rate_hz
     expected = np.abs(time_s - nominal) < SEARCH * nominal + SEARCH_S
     steady = (mean > STEADY * magnitude.mean(axis=0)) & (mean > LEAST_SNR * np.median(noise)) & (time_s > BANG_S) & ~expected
+    back = max(int(RISE_S * envelopes.rate_hz), 1)
+    steady[back:] &= mean[back:] > LEAST_RISE * mean[:-back]
     if not steady.any():
         return ""
     there_s = float(time_s[np.where(steady, mean, 0.0).argmax()])

@@ -39,6 +39,20 @@ def test_an_echo_at_rest_under_a_resting_probe_may_be_bone():
     assert forerun_remark(lines_with_forerun(17.0, 23.0, one_place=True)) == ""
 
 
+def test_an_echo_equally_deep_at_two_places_may_be_bone():
+    recording = lines_with_forerun(17.0, 23.0)
+    place = (np.arange(24) >= 12).astype(int)
+    two = replace(recording, probe_to_reference=recording.probe_to_reference[12 * place], palpation_points=place)
+    assert forerun_remark(two) == ""
+
+
 def test_lines_without_a_forerun_are_not_asked():
     recording = lines_with_forerun(17.0, 23.0)
     assert forerun_remark(replace(recording, acquisition=Acquisition(60e6, 5e6))) == ""
+
+
+def test_the_tail_of_the_transmit_pulse_is_no_forerun_where_the_face_is_matched_too_well_to_echo():
+    recording = lines_with_forerun(200.0, 20.0)  # no echo of a face in the line at all
+    time = np.arange(recording.lines.shape[1]) / 60e6
+    bang = 20000 * np.exp(-time / 0.7e-6) * np.cos(2 * np.pi * 5e6 * time)
+    assert forerun_remark(replace(recording, lines=(recording.lines + np.round(bang)).astype(np.int16))) == ""
