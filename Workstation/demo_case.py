@@ -9,6 +9,8 @@ import numpy as np
 from CranioNavLib.errors import InputError
 from CranioNavLib.volume import Volume
 
+SIMULATED = "Simulated patient, tracker and probe"  # a report says it first
+
 
 def choose_head(ct: Optional[Path]) -> tuple[Optional[Volume], str]:
     """The head CT to simulate a patient from, and its name for people; None stands for the synthetic head.

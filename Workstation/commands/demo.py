@@ -22,12 +22,13 @@ def demo(
     """
     import sys
     import time
+    from dataclasses import replace
 
     from CranioNavLib.case import read_case
     from CranioNavLib.files import output_folder
     from ModuleRegistrationLib.procedure import register_case
 
-    from Workstation.demo_case import choose_head, make_case
+    from Workstation.demo_case import SIMULATED, choose_head, make_case
     from Workstation.outputs import print_result, write_outputs
     from Workstation.terminal import print_json, progress_bar
 
@@ -37,7 +38,8 @@ def demo(
     with progress_bar() as say:
         say("simulating patient and devices", 0.0)
         case_folder = make_case(volume, seed, folder / "case")
-        result = register_case(read_case(case_folder), "III", method, progress=lambda step, share: say(step, 0.3 + 0.4 * share))
+        case = replace(read_case(case_folder), note=f"{SIMULATED}, seed {seed}")
+        result = register_case(case, "III", method, progress=lambda step, share: say(step, 0.3 + 0.4 * share))
         notes = {"head": head, "devices": "simulated tracker and A-mode probe", "seed": str(seed)}
         record = write_outputs(result, folder, notes=notes, progress=lambda step, share: say(step, 0.7 + 0.3 * share))
     if json:

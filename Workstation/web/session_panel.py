@@ -20,11 +20,11 @@ from CranioNavLib.parameters import Parameters
 from CranioNavLib.scripted_module import ScriptedLoadableModuleLogic
 from ModuleUltrasoundLib.measurement.measure import EchoSettings
 
+from Workstation.demo_case import SIMULATED
 from Workstation.web.session_folder import SessionFolder, last_session
 
 OFFERED = ("report.html", "report.pdf", "scene.mrb", "ReferenceToRas.tfm", "registration.json")  # what the page lets one open
 USUAL_REPORT_S = 15.0  # the bar stands at half then
-SIMULATED = "Simulated patient, tracker and probe"
 SAME_MM = 0.05  # between the registration on the screen and the one that the report repeats from the files
 
 
