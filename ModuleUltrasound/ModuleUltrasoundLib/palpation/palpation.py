@@ -57,6 +57,15 @@ class PalpationLine:
     frame: int = -1  # in the recording
 
 
+def _why_doubtful(line: PalpationLine, least_quality: float) -> str:
+    """Why a line cannot be a point wherever it is; empty if it can."""
+    if not line.accepted:
+        return line.reason or "not accepted"
+    if not np.isfinite(line.position_mm).all():
+        return "pose missing"
+    return "echo not sure enough" if line.quality < least_quality else ""
+
+
 class PalpationState(str, Enum):
     """What palpation is doing."""
 
@@ -179,12 +188,9 @@ class Palpation:
         return max(self.settings.longest_gap_s, min(MISSED * usual_s, SLOWEST_S))
 
     def _why_refused(self, line: PalpationLine) -> str:
-        if not line.accepted:
-            return line.reason or "not accepted"
-        if not np.isfinite(line.position_mm).all():
-            return "pose missing"
-        if line.quality < self.settings.least_quality:
-            return "echo not sure enough"
+        doubt = _why_doubtful(line, self.settings.least_quality)
+        if doubt:
+            return doubt
         if self._target_mm is not None:
             away = float(np.linalg.norm(line.position_mm - self._target_mm))
             if away > self.settings.target_radius_mm:
@@ -271,13 +277,8 @@ class Sweep:
         return reason
 
     def _why_refused(self, line: PalpationLine) -> str:
-        if not line.accepted:
-            return line.reason or "not accepted"
-        if not np.isfinite(line.position_mm).all():
-            return "pose missing"
-        if line.quality < self.settings.least_quality:
-            return "echo not sure enough"
-        return "probe too fast" if self._too_fast(line) else ""
+        doubt = _why_doubtful(line, self.settings.least_quality)
+        return doubt or ("probe too fast" if self._too_fast(line) else "")
 
     def _too_fast(self, line: PalpationLine) -> bool:
         """Over the longest gap that good lines are looked back for, less what noise moves a probe at rest."""
