@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.signal import hilbert
 
 from Testing.Benchmarks.echo import calibration, measure_world, rates
+from Testing.Studies import session_lines
 
 
 @pytest.mark.slow
@@ -38,3 +40,61 @@ def test_accepted_depths_are_right_in_a_few_simulated_worlds(family):
     assert found["within 0.5 mm"] >= 0.98
     assert found["within 0.25 mm"] >= 0.95
     assert found["accepted without bone"] <= 0.02
+
+
+@pytest.fixture(scope="module")
+def some_sessions():
+    return [session_lines.simulate(np.random.default_rng(92_000_000 + index), 40) for index in range(40)]
+
+
+def test_simulated_session_is_the_same_for_the_same_seed():
+    (one, truth, _), (again, other, _) = (session_lines.simulate(np.random.default_rng(5), 12) for _ in range(2))
+    np.testing.assert_array_equal(one.lines, again.lines)
+    np.testing.assert_array_equal(truth.depth_mm, other.depth_mm)
+    assert one.lines.dtype == np.int16
+
+
+@pytest.mark.parametrize("frames", [1, 4, 12, 60])
+def test_simulated_session_has_as_many_lines_as_asked_for(frames):
+    recording, truth, _ = session_lines.simulate(np.random.default_rng(frames), frames)
+    assert len(recording) == frames == len(truth.depth_mm) == len(truth.snr_db) == len(truth.tilt_deg)
+
+
+def test_echo_of_a_simulated_session_stands_where_the_truth_says(some_sessions):
+    off = []  # cycles
+    for recording, truth, session in some_sessions:
+        acquisition = recording.acquisition
+        if session.onset:  # of such a pulse the peak comes later
+            continue
+        line_us = 2e3 * acquisition.forerun_length_mm / (acquisition.forerun_speed_m_s or 1.0) * session.late
+        skin_us = line_us * (1 + session.warming * np.linspace(0, 1, len(recording)))
+        time_us = np.arange(recording.lines.shape[1]) / acquisition.sampling_hz * 1e6
+        for row in np.flatnonzero(truth.snr_db > 25):
+            arrival_us = skin_us[row] + truth.depth_mm[row] * 2e3 / truth.speed_m_s
+            near = np.abs(time_us - arrival_us) < 1.5 / session.centre_mhz
+            level = np.abs(hilbert(recording.lines[row] - recording.lines[row].mean()))[near]
+            off.append((time_us[near][level.argmax()] - arrival_us) * session.centre_mhz)
+    assert len(off) > 100
+    assert abs(np.median(off)) < 0.1
+    assert np.quantile(np.abs(off), 0.8) < 0.5
+
+
+def test_depth_is_continuous_within_a_place_and_places_are_apart(some_sessions):
+    for recording, truth, session in some_sessions:
+        if session.glides or not session.numbered:
+            continue
+        same = np.diff(recording.palpation_points) == 0
+        step = np.abs(np.diff(truth.depth_mm))[same]
+        assert np.nanmax(step, initial=0.0) < 0.8
+        apart = np.linalg.norm(np.diff(recording.probe_to_reference[:, :3, 3], axis=0), axis=1)
+        if not session.lifts:
+            assert (apart[~same] > 5).all()
+            assert (apart[same] < 2).all()
+
+
+def test_few_lines_of_a_simulated_session_cannot_be_read(some_sessions):
+    for _, truth, session in some_sessions:
+        bone = np.isfinite(truth.depth_mm)
+        assert (truth.snr_db[bone] < 8).sum() <= 0.2 * bone.sum()
+        assert (truth.snr_db[~bone] == -np.inf).all()
+        assert not (session.without and bone.any())
