@@ -23,6 +23,7 @@ SKULL_US_MM = 2 / 3.0  # there and back in bone
 LEAST_CODES = 0.5  # standard deviation of the noise: a converter that shows less shows no noise at all
 HARD_SHARE = 0.2  # of the lines with bone: of which nobody could say where the bone is
 CLEAR_DB, HEARD_DB = 3.0, 8.0  # over all before it, over the noise: what an expert asks of bone
+SPECKLE_PEAK = 2.5  # its largest echoes over their RMS
 NEAR_LINES = 4  # neighbours that tell where bone is
 VISIBLE_DB = 6.0  # speckle over the noise, where it goes on behind the depth of the bone
 SHOWN_MM = 3.0  # so far behind
@@ -207,7 +208,8 @@ def undecided(session: Session, pulse: Pulse, way: Way, bone: Array, noise: floa
     over = _bang_envelope(session, arrival) > 0.5 * received
     for time, height in _probe_echoes(session, way, skin_us, noise * 10 ** (session.snr_db / 20)):
         over |= (np.abs(time - arrival) < pulse.wide_us) & (np.abs(height) > 0.5 * received)
-    above = np.where(way.layers_mm < way.depth_mm[:, None], np.abs(way.layers), 0.0).max(axis=1) * way.coupling
+    above = np.where(way.layers_mm < way.depth_mm[:, None], np.abs(way.layers), 0.0).max(axis=1)
+    above = np.maximum(above, SPECKLE_PEAK * 10 ** (session.speckle_db / 20)) * way.coupling
     clear = ~faint & ~over & (np.nan_to_num(bone) > above * 10 ** (CLEAR_DB / 20))
     index = np.arange(len(bone))
     near = (np.abs(index - index[:, None]) <= NEAR_LINES) & (way.place == way.place[:, None])
@@ -299,5 +301,6 @@ def _receive(rng: np.random.Generator, session: Session, rf: Array, noise: float
     codes = 2 ** (session.bits - 1) - 1
     start = min(int((skin_us + 2e3 * DEPTH_MM[0] / session.speed_m_s) * sampling), samples // 2)
     largest = float(np.percentile(np.abs(rf[:, start:]).max(axis=1), 80))
-    scale = max(codes * session.fill / largest, LEAST_CODES / noise)
+    unrest = 1.5 * noise * (4 + session.hum + 1.6 * session.drift)  # echoes clip; what is below them does not
+    scale = max(codes / max(largest / session.fill, unrest), LEAST_CODES / noise)
     return np.asarray(np.clip(np.rint(rf * scale), -codes - 1, codes), dtype=np.int16)

@@ -1,5 +1,7 @@
 """The detector over many simulated worlds; the everyday suite takes a few of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import hilbert
@@ -77,6 +79,28 @@ def test_echo_of_a_simulated_session_stands_where_the_truth_says(some_sessions):
     assert len(off) > 100
     assert abs(np.median(off)) < 0.1
     assert np.quantile(np.abs(off), 0.8) < 0.5
+
+
+def test_echoes_of_a_simulated_session_may_clip_but_not_whole_lines(some_sessions):
+    for recording, _, session in some_sessions:
+        largest = 2 ** (session.bits - 1) - 1
+        assert np.abs(recording.lines.astype(int)).max() <= largest + 1
+        late = np.abs(recording.lines[:, recording.lines.shape[1] // 2 :].astype(int)) >= largest
+        assert late.mean(axis=1).max() < 0.2
+
+
+def test_probe_in_air_answers_from_its_face_alone():
+    plain = {"glides": False, "static": (), "trail": (), "hum": 0.0, "drift": 0.0, "spikes": 0.0, "bits": 14, "fill": 0.5}
+    drawn = (session_lines.draw_session(np.random.default_rng(seed)) for seed in range(100))
+    session = next(one for one in drawn if one.acquisition.forerun_length_mm > 20 and not one.without)
+    air, truth, _ = session_lines.simulate(np.random.default_rng(1), 12, replace(session, without="air", **plain))
+    assert np.isnan(truth.depth_mm).all()
+    acquisition = air.acquisition
+    face_us = 2e3 * acquisition.forerun_length_mm / acquisition.forerun_speed_m_s * session.late
+    first, last = (int((face_us + after) * acquisition.sampling_hz * 1e-6) for after in (4.0, 12.0))
+    silent = air.lines[:, first:last].astype(float).std()
+    assert np.abs(air.lines[:, first:last]).max() < 6 * silent
+    assert np.abs(air.lines[:, :first]).max() > 20 * silent
 
 
 def test_depth_is_continuous_within_a_place_and_places_are_apart(some_sessions):
