@@ -14,11 +14,22 @@ import scipy.fft
 from CranioNavLib.recording import Recording
 
 from Testing.Studies.line_truth import Truth
-from Testing.Studies.session_plan import BONE_R, DEPTH_MM, Array, Bools, Session, Way, draw_session, draw_way, response
+from Testing.Studies.session_plan import (
+    BONE_R,
+    DEPTH_MM,
+    Array,
+    Bools,
+    Session,
+    Way,
+    draw_poses,
+    draw_session,
+    draw_way,
+    response,
+)
 
 NEPER = np.log(10) / 20  # a decibel
 FINE, CYCLES, BEFORE = 64, 32, 12  # points a cycle of a tabulated pulse, its length, and where its time zero is
-PATHS_MM = np.linspace(0, 30, 21)  # depths for which the pulse is tabulated
+PATHS_MM = np.linspace(0, 30, 13)  # depths for which the pulse is tabulated
 SKULL_US_MM = 2 / 3.0  # there and back in bone
 LEAST_CODES = 0.5  # standard deviation of the noise: a converter that shows less shows no noise at all
 HARD_SHARE = 0.2  # of the lines with bone: of which nobody could say where the bone is
@@ -167,7 +178,7 @@ def simulate(rng: np.random.Generator, frames: int, session: Session | None = No
     recording = Recording(
         lines=_receive(rng, session, sheet.rf, noise, float(skin_us.max())),
         acquisition=session.acquisition,
-        probe_to_reference=way.poses,
+        probe_to_reference=draw_poses(session, rng, way),
         statuses=("OK",) * frames,
         timestamps_s=np.arange(frames) / float(rng.uniform(10, 60)),
         palpation_points=np.where(session.numbered, way.place, -1),

@@ -153,7 +153,6 @@ class Way:
     loss_db: Array  # (n,) by hair or a dry patch
     layers_mm: Array  # (n, 4) NaN: none
     layers: Array  # (n, 4) their echoes over bone's
-    poses: Array  # (n, 4, 4)
 
     @property
     def coupling(self) -> Array:
@@ -191,8 +190,7 @@ def draw_way(session: Session, rng: np.random.Generator, frames: int, skill: flo
     layers_mm[:, 3] = np.where(kind == "tissue", layers_mm[:, 3], np.nan)
     layers_mm[kind == "nothing"] = np.nan
     loss = _dry(rng, sizes)
-    poses = _poses(session, rng, place, tilt, contact)
-    return Way(place, kind.astype(np.str_), depth, tilt, contact, loss, layers_mm, layers, poses)
+    return Way(place, kind.astype(np.str_), depth, tilt, contact, loss, layers_mm, layers)
 
 
 def _sizes(rng: np.random.Generator, frames: int) -> list[int]:
@@ -289,8 +287,9 @@ def _layers(
     return np.where(tight, np.nan, at), level[place] * response(off, lobe[place], session.layer_floor_db)
 
 
-def _poses(session: Session, rng: np.random.Generator, place: npt.NDArray[np.int64], tilt: Array, contact: Array) -> Array:
+def draw_poses(session: Session, rng: np.random.Generator, way: Way) -> Array:
     """ProbeToReference of every line: the probe looks to the head, and lifts along its axis."""
+    place = way.place
     count, frames = int(place[-1]) + 1, len(place)
     spots = rng.uniform(-80, 80, (count, 3))
     for one in range(1, count):
@@ -302,9 +301,9 @@ def _poses(session: Session, rng: np.random.Generator, place: npt.NDArray[np.int
         turn = np.linspace(0, rng.uniform(-1, 1), frames)[:, None]
         origin = origin + np.cumsum(np.cos(turn) * heading + np.sin(turn) * heading[[1, 0, 2]] * [1, -1, 1], axis=0)
     facing = rigid_from_vector(rng.uniform(-1.5, 1.5, (count, 3)), np.zeros((count, 3)))[place]
-    local = rigid_from_vector(np.radians(np.pad(tilt, ((0, 0), (0, 1)))), np.zeros((frames, 3)))
+    local = rigid_from_vector(np.radians(np.pad(way.tilt_deg, ((0, 0), (0, 1)))), np.zeros((frames, 3)))
     turned = np.einsum("nij,njk->nik", facing, local)[:, :3, :3]
     if session.lifts and session.without != "air":
-        away = np.where(contact == 0, rng.uniform(5, 30, frames), 0.0)
+        away = np.where(way.contact == 0, rng.uniform(5, 30, frames), 0.0)
         origin = origin - away[:, None] * turned[:, :, 2]
     return rigid(turned, origin)
