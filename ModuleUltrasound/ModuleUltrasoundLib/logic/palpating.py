@@ -46,7 +46,7 @@ class PalpationStep(SweepStep, MeasureStep):
         if registered():
             target = np.array(points.GetNthControlPointPosition(index))[None]
             expected = transform_points(invert_rigid(scene_data.get_transform("ReferenceToRas")), target)[0]
-        self.palpation.aim(index, expected)
+        self.palpation.aim(index, expected, self._changes[-1][0])
 
     def disconnect(self) -> None:
         """Let go of the device; a recording under way is finished."""

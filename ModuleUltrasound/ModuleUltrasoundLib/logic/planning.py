@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Optional
+import time
+from collections import deque
+from typing import Any, Optional
 
 import numpy as np
 from CranioNavLib import scene, scene_data
@@ -16,6 +18,7 @@ from ModuleUltrasoundLib.devices.device import DeviceError
 from ModuleUltrasoundLib.devices.line_stream import LineStream
 from ModuleUltrasoundLib.panel_description import UltrasoundParameters
 
+CHANGES = 16  # of the point asked for that are remembered: no line waits for longer
 CURRENT_POINT = "current"  # parameter of the Protocol node: index of the point to palpate now
 NORMALS = ("Normal_R", "Normal_A", "Normal_S")  # measurements of ProtocolPoints: outward normals of the bone
 
@@ -27,6 +30,10 @@ class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
     sessionRole = "UltrasoundSession"
     refusals = (DeviceError,)
     deviceWord = "probe"
+
+    def __init__(self, parent: Any = None) -> None:
+        super().__init__(parent)
+        self._changes: deque[tuple[float, int]] = deque(maxlen=CHANGES)  # when another point was asked for, and which was before
 
     def planProtocol(self) -> str:
         """Place the palpation points on the outer table; writes ProtocolPoints and Protocol. Returns a message."""
@@ -85,8 +92,18 @@ class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
         text = node.GetParameter(CURRENT_POINT) if node is not None else ""
         return int(text) if text and count_of("ProtocolPoints") else -1
 
+    def indexAt(self, host_time_s: float) -> int:
+        """Index of the point that was asked for at a moment of the clock of lines; -1 without a protocol."""
+        index = self.currentIndex()
+        for changed_s, before in reversed(self._changes):
+            if host_time_s >= changed_s:
+                break
+            index = before
+        return index
+
     def goTo(self, index: int) -> None:
-        """Ask for a point."""
+        """Ask for a point, from now on: lines on their way still belong to the one before."""
+        self._changes.append((time.monotonic(), self.currentIndex()))
         scene.find_or_create("Protocol").SetParameter(CURRENT_POINT, str(index))
 
     def currentPoint(self) -> Optional[Reading]:

@@ -80,7 +80,7 @@ class ProbeStep(ProtocolStep):
             raise
         assert self.poser is not None  # there is one while there is a stream
         for line in lines:
-            self.poser.add_line(line, self.currentIndex())
+            self.poser.add_line(line, self.indexAt(line.host_time_s))
         posed = self.poser.ready()
         if posed:
             self.latest = posed[-1]

@@ -33,6 +33,10 @@ class SweepStep(AskStep):
         """Index of the point to palpate now; -1 without a protocol, and while the probe glides."""
         return -1 if self.sweep is not None else super().currentIndex()
 
+    def indexAt(self, host_time_s: float) -> int:
+        """Index of the point that was asked for at a moment; -1 for all lines of a recording of a gliding probe."""
+        return -1 if self.sweep is not None else super().indexAt(host_time_s)
+
     def aimAt(self, probe_to_ras: Array, surface: Surface) -> Optional[tuple[Array, Array]]:
         """While the probe glides it is where it has to be; it only has to stand upright on the bone."""
         if self.sweep is None:

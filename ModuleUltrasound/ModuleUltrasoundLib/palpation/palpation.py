@@ -119,6 +119,7 @@ class Palpation:
         self._times: deque[float] = deque(maxlen=USUAL_LINES)  # of the last lines, good or not
         self._target: Optional[int] = 0
         self._target_mm: Optional[Array] = None
+        self._asked_s = -np.inf  # since when it is asked for, in the time of the lines
 
     # -- progress
 
@@ -138,8 +139,10 @@ class Palpation:
         closed = {point.target for point in self._taken}
         return [index not in closed for index in range(len(self.labels))]
 
-    def aim(self, target: int, position_mm: Optional[Array] = None) -> None:
-        """Make a point the next; `position_mm` (3,) in Reference, where it is expected under the registration.
+    def aim(self, target: int, position_mm: Optional[Array] = None, asked_s: float = -np.inf) -> None:
+        """Make a point the next; lines taken before `asked_s` are not on it, though they come later.
+
+        `position_mm` (3,) in Reference is where it is expected under the registration.
 
         Raises
         ------
@@ -150,7 +153,8 @@ class Palpation:
             raise InputError(f"no point {target} in a protocol of {len(self.labels)}")
         if target != self._target:
             self._dwell.clear()
-        self._target, self._target_mm = target, None if position_mm is None else np.asarray(position_mm, dtype=float)
+        self._target, self._asked_s = target, asked_s
+        self._target_mm = None if position_mm is None else np.asarray(position_mm, dtype=float)
 
     def undo(self) -> Optional[TakenPoint]:
         """Take back the last point and return to it; None if there is none."""
@@ -188,6 +192,8 @@ class Palpation:
         return max(self.settings.longest_gap_s, min(MISSED * usual_s, SLOWEST_S))
 
     def _why_refused(self, line: PalpationLine) -> str:
+        if line.time_s < self._asked_s:
+            return "taken before the point was asked for"
         doubt = _why_doubtful(line, self.settings.least_quality)
         if doubt:
             return doubt

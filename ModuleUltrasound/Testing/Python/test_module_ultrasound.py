@@ -22,6 +22,7 @@ from ModuleUltrasoundLib.emulators.amode_serial import SerialPulser
 from ModuleUltrasoundLib.emulators.faults import Faults
 from ModuleUltrasoundLib.emulators.line_source import RecordedLines
 from ModuleUltrasoundLib.emulators.server import served
+from ModuleUltrasoundLib.palpation.palpation import PalpationLine
 
 import ModuleUltrasound as module
 
@@ -274,6 +275,41 @@ def test_lines_of_a_probe_that_still_rests_on_a_taken_point_are_not_the_next_poi
         stood = np.linalg.norm(places - on_point(logic, number)[:3, 3], axis=1) < 1.0
         assert stood.any()
         assert set(recording.palpation_points[stood].tolist()) == {number}
+
+
+def test_lines_that_wait_while_another_point_is_asked_for_stay_with_the_one_they_were_taken_at(a_recording_logic, tmp_path):
+    logic = a_recording_logic
+    time.sleep(0.3)  # a redraw: lines wait in the queue
+    logic.nextPoint()
+    pressed_s = time.monotonic() - logic.recorder.start_s
+    run_for(logic, 0.4, on_point(logic, 1))
+    logic.closeRecording()
+    recording = read_recording(tmp_path / "r.igs.mha")
+    assert recording.palpation_points.tolist() == (recording.timestamps_s >= pressed_s).astype(int).tolist()
+    assert (recording.palpation_points == 0).sum() > 10
+
+
+def lines_on(logic, index, start_s):
+    """Measured lines of a probe that rests on a point for 0.6 s, twenty a second."""
+    positions, normals, _ = logic.protocolPoints()
+    moments = start_s + np.arange(13) / 20
+    return [PalpationLine(t, True, 0.95, "", positions[index], np.eye(3), -normals[index], DEPTH_MM) for t in moments]
+
+
+@pytest.mark.parametrize("press", ["nextPoint", "undoPoint", "none: the point was taken"])
+def test_lines_that_wait_to_be_measured_are_not_the_point_that_is_asked_for_now(a_recording_logic, press):
+    logic, now_s = a_recording_logic, time.monotonic()
+    logic.palpation.aim(0, asked_s=now_s - 9)
+    if press != "nextPoint":
+        logic.takePoints(lines_on(logic, 0, now_s - 3))
+        assert len(logic.taken()) == 1
+    if hasattr(logic, press):
+        getattr(logic, press)()
+    asked, before = logic.currentIndex(), logic.taken()
+    logic.takePoints(lines_on(logic, asked, now_s - 1))
+    assert logic.taken() == before
+    logic.takePoints(lines_on(logic, asked, time.monotonic()))
+    assert logic.taken() == [*before, logic.protocolPoints()[2][asked]]
 
 
 def know_the_error(logic):

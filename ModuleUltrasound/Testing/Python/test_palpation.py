@@ -172,6 +172,27 @@ def test_undo_returns_to_the_last_point():
     assert palpation.target == 0
 
 
+def test_a_line_taken_before_its_point_was_asked_for_is_not_its_point():
+    palpation = Palpation(LABELS)
+    rest(palpation, (0, 0, 0), 0.0, seconds=0.4)
+    palpation.aim(1, asked_s=5.0)
+    states = rest(palpation, (0, 0, 0), 4.3)
+    assert {status.reason for status in states} == {"taken before the point was asked for"}
+    assert states[-1].state is PalpationState.WAITING
+    states = rest(palpation, (0, 0, 0), 4.9)
+    assert [status.new_point.label for status in states if status.new_point] == ["B"]
+    assert states[-1].new_point.lines == 11  # of 13
+
+
+def test_asked_for_again_a_point_takes_lines_from_then_on():
+    palpation = Palpation(LABELS)
+    rest(palpation, (0, 0, 0), 0.0)
+    palpation.undo()
+    palpation.aim(0, asked_s=1.0)
+    assert not any(status.new_point for status in rest(palpation, (0, 0, 0), 0.6, seconds=0.85))
+    assert palpation.add(a_line(1.5)).new_point is not None
+
+
 def test_points_that_do_not_exist_are_refused():
     with pytest.raises(InputError, match="no point 3 in a protocol of 3"):
         Palpation(LABELS).aim(3)
