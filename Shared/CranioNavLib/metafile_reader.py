@@ -264,7 +264,7 @@ def _read_transforms(header: _Header, count: int) -> tuple[dict[str, Array], dic
         wanted = [index for index in sorted(texts) if index < count and states.get(index, "OK").upper() == "OK"]
         matrices = np.full((count, 4, 4), np.nan)
         matrices[wanted] = _parse_matrices(header, header.frame_names[key], [texts[index] for index in wanted], wanted)
-        name, good = key[: -len("transform")], set(wanted)
+        name, good = key[: -len("transform")], set(np.flatnonzero(np.isfinite(matrices).all(axis=(1, 2))).tolist())
         poses[name] = matrices
         statuses[name] = tuple("OK" if index in good else _not_ok(states.get(index, "MISSING").upper()) for index in range(count))
     return poses, statuses
@@ -275,6 +275,7 @@ def _not_ok(status: str) -> str:
 
 
 def _parse_matrices(header: _Header, name: str, texts: list[str], frames: list[int]) -> Array:
+    """(F, 4, 4) NaN where a number is not finite: that frame has no pose. Numbers that are none of a rigid pose are refused."""
     rows = [text.split() for text in texts]
     for row, frame in zip(rows, frames):
         if len(row) != 16:
@@ -283,8 +284,13 @@ def _parse_matrices(header: _Header, name: str, texts: list[str], frames: list[i
         matrices = np.array(rows, dtype=float).reshape(-1, 4, 4)
     except ValueError as error:
         raise header.refuse(f"{name}: {error}; expected 16 numbers a frame with '.' as decimal point") from None
-    bad = ~np.isfinite(matrices).all(axis=(1, 2))
-    _refuse_first(header, name, bad, frames, "holds a value that is not a finite number")
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    _refuse_if_not_rigid(header, name, matrices[finite], [frame for frame, good in zip(frames, finite) if good])
+    matrices[~finite] = np.nan
+    return matrices
+
+
+def _refuse_if_not_rigid(header: _Header, name: str, matrices: Array, frames: list[int]) -> None:
     last = np.abs(matrices[:, 3] - (0, 0, 0, 1)).max(axis=1) > 1e-6
     _refuse_first(header, name, last, frames, "is not a rigid transform (last row not 0 0 0 1); write it row by row")
     turn = matrices[:, :3, :3]
@@ -293,7 +299,6 @@ def _parse_matrices(header: _Header, name: str, texts: list[str], frames: list[i
     _refuse_first(header, name, np.linalg.det(turn) < 0, frames, "mirrors; check for swapped or flipped axes")
     far = np.abs(matrices[:, :3, 3]).max(axis=1, initial=0) > LARGEST_COORDINATE_MM
     _refuse_first(header, name, far, frames, "lies more than 100 m away; translations are expected in mm")
-    return matrices
 
 
 def _refuse_first(header: _Header, name: str, bad: npt.NDArray[np.bool_], frames: list[int], problem: str) -> None:

@@ -137,6 +137,17 @@ def test_ok_without_a_pose_is_missing(a_file, a_path):
     assert read_recording(a_file.save(a_path)).statuses == ("OK", "MISSING")
 
 
+@pytest.mark.parametrize("value", ["nan", "-NaN", "inf"])
+def test_ok_with_a_pose_that_is_not_finite_is_missing_in_that_frame_alone(a_file, a_path, value):
+    a_file.fields["Seq_Frame0000_ProbeToReferenceTransform"] = POSE.replace("20", value)
+    a_file.fields["Seq_Frame0001_ProbeToReferenceTransform"] = POSE
+    a_file.fields["Seq_Frame0001_ProbeToReferenceTransformStatus"] = "OK"
+    recording = read_recording(a_file.save(a_path))
+    assert recording.statuses == ("MISSING", "OK")
+    assert np.isnan(recording.probe_to_reference[0]).all()
+    np.testing.assert_array_equal(recording.probe_to_reference[1][:3, 3], [10, 20, -30])
+
+
 def test_a_frame_whose_line_is_invalid_never_becomes_a_point(a_file, a_path):
     a_file.fields["Seq_Frame0000_ImageStatus"] = "INVALID"
     recording = read_recording(a_file.save(a_path))
@@ -202,13 +213,20 @@ DAMAGE = {
         {"Seq_Frame0000_ProbeToReferenceTransform": POSE.replace("20", "xx")},
         "ProbeToReferenceTransform: .*xx",
     ),
-    "NaN in a pose": ({"Seq_Frame0000_ProbeToReferenceTransform": POSE.replace("20", "nan")}, "frame 0: .* not a finite number"),
     "transposed pose": (
         {"Seq_Frame0000_ProbeToReferenceTransform": "1 0 0 0 0 1 0 0 0 0 1 0 10 20 30 1"},
         "last row not 0 0 0 1",
     ),
     "scaled pose": ({"Seq_Frame0000_ProbeToReferenceTransform": POSE.replace("1 0 0 10", "2 0 0 10")}, "not rigid"),
     "mirrored pose": ({"Seq_Frame0000_ProbeToReferenceTransform": POSE.replace("1 0 0 10", "-1 0 0 10")}, "mirrors"),
+    "scaled pose after one that is not finite": (
+        {
+            "Seq_Frame0000_ProbeToReferenceTransform": POSE.replace("20", "nan"),
+            "Seq_Frame0001_ProbeToReferenceTransform": POSE.replace("1 0 0 10", "2 0 0 10"),
+            "Seq_Frame0001_ProbeToReferenceTransformStatus": "OK",
+        },
+        "frame 1: .* not rigid",
+    ),
     "pose far away": ({"Seq_Frame0000_ProbeToReferenceTransform": POSE.replace("20", "2e8")}, "more than 100 m away"),
     "a time that is no number": ({"Seq_Frame0001_Timestamp": "later"}, "Timestamp: .*later"),
     "a time that is NaN": ({"Seq_Frame0001_Timestamp": "nan"}, "frame 1: Timestamp is not a finite number"),
