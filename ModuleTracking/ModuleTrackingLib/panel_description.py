@@ -27,6 +27,7 @@ class PointList(str, Enum):
     BONE = "SurfacePoints"
     TARGETS = "TargetsPatient"
     PLAUSIBILITY = "PlausibilityPoints"
+    CLAMP = "ClampPins"
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,7 @@ PANEL = Panel(
                 NodeField("SurfacePoints", "Bone points"),
                 NodeField("TargetsPatient", "Targets"),
                 NodeField("PlausibilityPoints", "Plausibility"),
+                NodeField("ClampPins", "Clamp pins", "Where the pins of the head clamp enter the skin: the probe is kept away"),
             ),
             status="pointsStatus",
         ),

@@ -80,7 +80,9 @@ PANEL = Panel(
             items=(
                 NodeField("OuterTable", "Outer table"),
                 NodeField("LandmarksCT", "Landmarks in the CT"),
+                NodeField("ClampPins", "Pins of the head clamp"),
                 ParameterField("patient_lies", "The patient lies"),
+                ReadOut("clampPins", "Head clamp"),
                 Action("planProtocol", "Plan points", "Place the palpation points", primary=True),
                 ReadOut("currentPoint", "Palpate now", large=True),
                 Action("nextPoint", "Next point", "Go on to the next point", shortcut="Right"),

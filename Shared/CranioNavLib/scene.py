@@ -57,6 +57,7 @@ ROLES: dict[str, Role] = {
         Role("SurfacePoints", _POINTS, (TRACKING, ULTRASOUND), "ReferenceToRas", VERMILION),
         Role("TargetsPatient", _POINTS, (TRACKING, ULTRASOUND), "ReferenceToRas", PURPLE),
         Role("PlausibilityPoints", _POINTS, (TRACKING, ULTRASOUND), "ReferenceToRas", SKY),
+        Role("ClampPins", _POINTS, (TRACKING,), "ReferenceToRas", ORANGE),
         Role("ReferenceToTracker", _MOVE, (TRACKING,)),
         Role("StylusToReference", _MOVE, (TRACKING,), "ReferenceToRas"),
         Role("ProbeToReference", _MOVE, (TRACKING,), "ReferenceToRas"),

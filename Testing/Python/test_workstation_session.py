@@ -85,6 +85,7 @@ def test_a_session_killed_at_any_step_goes_on_exactly_where_it_was(a_recorded_pa
     from CranioNavLib.case import read_case
 
     folder, case = tmp_path / "session", read_case(a_recorded_patient)
+    pins = LabelledPoints(("C1",), case.landmarks_patient.positions_mm[1:2])
 
     def palpate(one: Workstation) -> None:
         shutil.copy(a_recorded_patient / "palpation.igs.mha", folder / "palpation.igs.mha")
@@ -95,6 +96,7 @@ def test_a_session_killed_at_any_step_goes_on_exactly_where_it_was(a_recorded_pa
         ("bone", lambda one: one.do("ModuleRegistration", "segmentBone")),
         ("landmarks", lambda one: scene_data.set_points("LandmarksPatient", case.landmarks_patient)),
         ("landmarks", lambda one: one.do("ModuleRegistration", "registerLandmarks")),
+        ("landmarks", lambda one: scene_data.set_points("ClampPins", pins)),
         ("ultrasound", lambda one: (one.do("ModuleUltrasound", "planProtocol"), one.do("ModuleUltrasound", "nextPoint"))),
         ("ultrasound", palpate),
         ("ultrasound", lambda one: one.do("ModuleRegistration", "registerSurface")),
@@ -238,14 +240,15 @@ def test_of_a_patient_laid_on_the_table_before_nothing_stays(tmp_path):
     laid = SimpleNamespace(landmark_labels=("a", "b", "c"), landmarks_ras_mm=places, markers_ras_mm=places)
     volume = Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), "nothing")
     hand._take(SimpleNamespace(patient=laid), volume, "one")
-    for role in ("LandmarksPatient", "SurfacePoints", "TargetsPatient", "ProtocolPoints", "RegisteredPoints"):
+    for role in ("LandmarksPatient", "SurfacePoints", "TargetsPatient", "ClampPins", "ProtocolPoints", "RegisteredPoints"):
         scene_data.set_points(role, LabelledPoints(("a", "b", "c"), places))
     scene_data.set_transform("ReferenceToRas", np.diag([-1.0, -1.0, 1.0, 1.0])).SetAttribute("CranioNav.Status", "accepted")
     scene_data.set_table("Results", {"quantity": ["verdict"], "value": ["accepted"]})
     (tmp_path / "palpation.igs.mha").write_text("of the one before")
     hand._take(SimpleNamespace(patient=laid), volume, "another")
     use_session(None)
-    for role in ("LandmarksPatient", "SurfacePoints", "TargetsPatient", "ProtocolPoints", "RegisteredPoints", "Results"):
+    touched = ("LandmarksPatient", "SurfacePoints", "TargetsPatient", "ClampPins")
+    for role in (*touched, "ProtocolPoints", "RegisteredPoints", "Results"):
         assert scene.find(role) is None, role
     assert running.logics["Navigation"].navigationStatus().state is StepState.TODO
     assert running.models["ModuleUltrasound"].blocked(running.action("ModuleUltrasound", "measureRecording"))

@@ -30,6 +30,7 @@ STYLES = {
     "SurfacePoints": PointStyle(4.0, "ThickCross2D", ("ultrasound",)),
     "RegisteredPoints": PointStyle(3.5, "Sphere3D", ("ultrasound", "verification")),
     "PlausibilityPoints": PointStyle(4.0, "Square2D", ("verification",)),
+    "ClampPins": PointStyle(6.0, "StarBurst2D", ("landmarks", "ultrasound")),
 }
 ASKED_FOR = (0.9, 0.25, 0.0)  # Okabe and Ito's vermilion, a little stronger: the point to place, touch or palpate now
 MARKED = ("LandmarksCT", "ProtocolPoints")  # lists of which one point is asked for

@@ -24,6 +24,7 @@ LISTS = {
     "TargetsCT": "targets-ct.mrk.json",
     "TargetsPatient": "targets-patient.mrk.json",
     "PlausibilityPoints": "plausibility.mrk.json",
+    "ClampPins": "clamp-pins.mrk.json",
 }
 PATHS = ("_path", "_folder")  # how parameters that name files end
 TABLES = ("Residuals", "TargetErrors")

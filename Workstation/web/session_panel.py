@@ -134,12 +134,12 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
 
             use_session(patient)
             self.session.simulated_seed = state["simulated_seed"]
-        if state["planned"] and bone is not None:
-            ultrasound.planProtocol()
-            ultrasound.goTo(int(state.get("asked_for", 0)))
         if take is not None:
             take()
         self.session.restore_registration(state)
+        if state["planned"] and bone is not None:  # away from the clamp, which the registration places
+            ultrasound.planProtocol()
+            ultrasound.goTo(int(state.get("asked_for", 0)))
         self._go_to(state["step"])
         return "the session goes on where it was; connect the devices again"
 

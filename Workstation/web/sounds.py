@@ -8,7 +8,7 @@ from typing import Any
 from CranioNavLib import scene, scene_data
 from CranioNavLib.panel import Level
 
-TOUCHED = ("LandmarksPatient", "TargetsPatient", "PlausibilityPoints")
+TOUCHED = ("LandmarksPatient", "TargetsPatient", "PlausibilityPoints", "ClampPins")
 TOOLS = ("Stylus", "Probe", "Sphere")
 
 

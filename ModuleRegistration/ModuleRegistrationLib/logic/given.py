@@ -25,6 +25,7 @@ WORDS = {  # for what is missing
     "TargetsCT": "targets in the CT",
     "TargetsPatient": "targets measured on the patient",
     "PlausibilityPoints": "plausibility points",
+    "ClampPins": "pins of the head clamp",
 }
 
 

@@ -14,7 +14,8 @@ from CranioNavLib.volume import Volume
 from ModuleRegistrationLib.logic.given import RegistrationStep, filled
 from ModuleRegistrationLib.logic.results import forget_registration
 
-OF_THE_PATIENT = ("LandmarksPatient", "SurfacePoints", "TargetsPatient", "PlausibilityPoints")  # a new CT of him leaves them
+# A new CT of him leaves them.
+OF_THE_PATIENT = ("LandmarksPatient", "SurfacePoints", "TargetsPatient", "PlausibilityPoints", "ClampPins")
 
 
 class LoadingStep(RegistrationStep):

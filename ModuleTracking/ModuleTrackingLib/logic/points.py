@@ -19,7 +19,13 @@ from ModuleTrackingLib.panel_description import PointList
 APART_MM = 2.0  # a point so near to the one read before is the same one again
 PLANNED = {PointList.LANDMARKS: "LandmarksCT", PointList.TARGETS: "TargetsCT"}  # where the names of the points come from
 CHECKS = (PointList.TARGETS, PointList.PLAUSIBILITY)  # what a registration is verified with
-LETTERS = {PointList.LANDMARKS: "L", PointList.BONE: "B", PointList.TARGETS: "T", PointList.PLAUSIBILITY: "P"}
+LETTERS = {
+    PointList.LANDMARKS: "L",
+    PointList.BONE: "B",
+    PointList.TARGETS: "T",
+    PointList.PLAUSIBILITY: "P",
+    PointList.CLAMP: "C",
+}
 
 
 class PointsStep(CalibrationStep):

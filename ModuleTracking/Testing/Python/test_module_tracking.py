@@ -161,12 +161,13 @@ def test_markers_and_places_on_the_bone_are_read_to_verify_with_and_taken_back_i
     assert a_logic.undoCheckBlocked() == "nothing has been read"
 
 
-def test_points_go_to_the_list_that_is_chosen(a_logic):
+@pytest.mark.parametrize(("points", "label"), [(PointList.PLAUSIBILITY, "P1"), (PointList.CLAMP, "C1")])
+def test_points_go_to_the_list_that_is_chosen(a_logic, points, label):
     a_logic.connect()
-    a_logic.parameters().change(points=PointList.PLAUSIBILITY, tool=Tool.STYLUS)
+    a_logic.parameters().change(points=points, tool=Tool.STYLUS)
     run_for(a_logic, 0.2)
     a_logic.digitise()
-    assert scene_data.get_points("PlausibilityPoints").labels == ("P1",)
+    assert scene_data.get_points(points.value).labels == (label,)
     assert scene.find("LandmarksPatient") is None
 
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from CranioNavLib import scene_data
 from CranioNavLib.panel import Reading
 
-from ModuleUltrasoundLib.logic.planning import count_of, registered
+from ModuleUltrasoundLib.logic.planning import clamp_pins, count_of, registered
 from ModuleUltrasoundLib.logic.probing import ProbeStep
 from ModuleUltrasoundLib.panel_description import TOWARDS_TABLE
 
@@ -78,10 +78,12 @@ class AskStep(ProbeStep):
         return ProtocolPoints(labels, positions, normals, labels)
 
     def _within_reach(self, plan: ProtocolPoints) -> npt.NDArray[np.bool_]:
-        """The reference base stands on the head clamp: a probe that would run into it cannot be held there."""
+        """A probe that would run into a pin of the head clamp, or into the reference base on it, cannot be held there."""
         from ModuleUltrasoundLib.palpation.next_point import reachable
 
         clamp = scene_data.get_transform("ReferenceToRas")[:3, 3][None] if registered() else None
+        pins = clamp_pins()
+        clamp = clamp if pins is None else np.concatenate([pins, clamp])
         return reachable(plan, clamp, TOWARDS_TABLE[self.parameters().read().patient_lies])
 
     def _best(self, plan: ProtocolPoints, candidates: npt.NDArray[np.bool_], taken: list[int]) -> Optional[NextTarget]:

@@ -10,8 +10,8 @@ import numpy as np
 from CranioNavLib import scene, scene_data
 from CranioNavLib.errors import InputError
 from CranioNavLib.module_logic import DeviceInScene, done_or
-from CranioNavLib.panel import Reading, StepStatus
-from CranioNavLib.rigid import Array
+from CranioNavLib.panel import Level, Reading, StepStatus
+from CranioNavLib.rigid import Array, transform_points
 from CranioNavLib.slicer_files import LabelledPoints
 
 from ModuleUltrasoundLib.devices.device import DeviceError
@@ -44,13 +44,26 @@ class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
             scene_data.get_surface("OuterTable"),
             landmarks.positions_mm if landmarks else None,
             landmarks.labels if landmarks else None,
+            clamp_pins(),
         )
         node = scene_data.set_points("ProtocolPoints", LabelledPoints(planned.labels, planned.positions_ras_mm))
         for axis, name in enumerate(NORMALS):
             scene_data.add_measurement(node, name, planned.normals[:, axis])
         self.goTo(0)
-        missing = f"; no bone to stand on for {', '.join(planned.left_out)}" if planned.left_out else ""
+        missing = f"; no place to stand for {', '.join(planned.left_out)}" if planned.left_out else ""
         return f"{len(planned.labels)} points{missing}"
+
+    def clampPins(self) -> Reading:
+        """How many pins of the head clamp are known, and how far the points keep from them."""
+        from ModuleUltrasoundLib.palpation.clamp import CLEARANCE_MM
+
+        count = count_of("ClampPins")
+        if not count:
+            return Reading("no pins known; touch them with the stylus to keep away from them")
+        known = f"{count} pin{'s' if count > 1 else ''}"
+        if clamp_pins() is None:
+            return Reading(f"{known}; where they are on the head is known once the landmarks are registered", Level.WARNING)
+        return Reading(f"{known}; the probe keeps {CLEARANCE_MM:.0f} mm away", Level.GOOD)
 
     def planProtocolBlocked(self) -> str:
         """Why no points can be placed now."""
@@ -126,3 +139,10 @@ def registered() -> bool:
     """Whether ReferenceToRas is a registration."""
     node = scene.find("ReferenceToRas")
     return node is not None and bool(node.GetAttribute(scene.STATUS_ATTRIBUTE))
+
+
+def clamp_pins() -> Optional[Array]:
+    """(K, 3) the pins of the head clamp in RAS; None where none is known, or no registration says where it is."""
+    if not registered() or not count_of("ClampPins"):
+        return None
+    return transform_points(scene_data.get_transform("ReferenceToRas"), scene_data.get_points("ClampPins").positions_mm)

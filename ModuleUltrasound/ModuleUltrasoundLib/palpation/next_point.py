@@ -14,16 +14,15 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.parameters import Limits, Parameters
 from CranioNavLib.rigid import Array, check_points
 
+from ModuleUltrasoundLib.palpation.clamp import CLEARANCE_MM, clear_of_clamp
 from ModuleUltrasoundLib.palpation.protocol import ProtocolPoints
-
-PROBE_LENGTH_MM = 150.0  # what a probe with the hand takes up outside the head
 
 
 @dataclass(frozen=True)
 class ReachSettings(Parameters):
     """What is in the way of the probe, and what a point is worth."""
 
-    clamp_clearance_mm: Annotated[float, Limits(0, 200), "between the probe and any part of the head clamp"] = 30.0
+    clamp_clearance_mm: Annotated[float, Limits(0, 200), "between the probe and any part of the head clamp"] = CLEARANCE_MM
     point_sd_mm: Annotated[float, Limits(0.05, 10), "expected error of a point along the bone's normal"] = 0.6
     support_angle_deg: Annotated[float, Limits(0, 90), "normals nearer than this to the table's direction are out of reach"] = (
         50.0
@@ -148,13 +147,7 @@ def reachable(
     settings : ReachSettings, optional
     """
     settings = settings or DEFAULTS
-    free = np.ones(len(points), dtype=bool)
-    if clamp_ras_mm is not None:
-        clamp = check_points(clamp_ras_mm, "points on the clamp")
-        for index, (foot, normal) in enumerate(zip(points.positions_ras_mm, points.normals)):
-            along = np.clip((clamp - foot) @ normal, 0.0, PROBE_LENGTH_MM)
-            gaps = np.linalg.norm(clamp - foot - along[:, None] * normal, axis=1)
-            free[index] = len(gaps) == 0 or gaps.min() >= settings.clamp_clearance_mm
+    free = clear_of_clamp(points.positions_ras_mm, points.normals, clamp_ras_mm, settings.clamp_clearance_mm)
     if table_direction_ras is not None:
         down = np.asarray(table_direction_ras, dtype=float)
         free &= points.normals @ (down / np.linalg.norm(down)) < np.cos(np.radians(settings.support_angle_deg))

@@ -17,6 +17,8 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array, check_points, invert_rigid, rigid, transform_directions, transform_points
 from CranioNavLib.surface import Surface
 
+from ModuleUltrasoundLib.palpation.clamp import clear_of_clamp
+
 LANDMARK_LABELS = ("Nasion", "Left frontozygomatic", "Right frontozygomatic", "Anterior nasal spine")
 REGIONS = ("Left lateral", "Right lateral", "Frontal convexity", "Forehead", "Periorbital")
 
@@ -64,7 +66,7 @@ class ProtocolPoints:
     normals: Array  # (N, 3) unit, of the plane through the bone under the probe
     regions: tuple[str, ...]
     head_to_ras: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) origin at the nasion, x right, y anterior, z up
-    left_out: tuple[str, ...] = ()  # labels of points whose place is taken by an opening of the skull
+    left_out: tuple[str, ...] = ()  # labels of points whose place is taken by an opening of the skull or the clamp
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -81,7 +83,10 @@ class _Spot:
 
 
 def plan_protocol(
-    surface: Surface, landmarks_ras_mm: Optional[npt.ArrayLike] = None, labels: Optional[Sequence[str]] = None
+    surface: Surface,
+    landmarks_ras_mm: Optional[npt.ArrayLike] = None,
+    labels: Optional[Sequence[str]] = None,
+    clamp_ras_mm: Optional[npt.ArrayLike] = None,
 ) -> ProtocolPoints:
     """The 18 points of the protocol on a skull.
 
@@ -94,12 +99,14 @@ def plan_protocol(
         order) they give the head's axes; else the RAS axes and the surface's shape do.
     labels : sequence of str, optional
         Names of the landmarks.
+    clamp_ras_mm : array-like, shape (K, 3), optional
+        Points on the head clamp that a probe has to keep clear of.
 
     Returns
     -------
     ProtocolPoints
         Three left lateral, three right lateral, four each on frontal convexity, forehead and around the orbits; without
-        those whose place, and all around it, is an opening of the skull.
+        those whose place, and all around it, is an opening of the skull or under the clamp.
 
     Raises
     ------
@@ -111,7 +118,7 @@ def plan_protocol(
     windows: dict[tuple[str, int], list[_Spot]] = {}
     for name in PAIRS:
         for side in (-1, 1):
-            windows[name, side] = _spots_for(surface, head_to_ras, center, reach, name, side)
+            windows[name, side] = _spots_for(surface, head_to_ras, center, reach, name, side, clamp_ras_mm)
     left_out = _check_left_out(windows)
     windows = {key: spots for key, spots in windows.items() if spots}
     chosen = _choose(windows, center)
@@ -141,7 +148,7 @@ def _check_left_out(windows: dict[tuple[str, int], list[_Spot]]) -> list[tuple[s
         name, side = empty[0]
         raise InputError(
             f"no place for the probe at {'left' if side < 0 else 'right'} {name.lower()}: the bone surface is missing or too "
-            "rough there; extend or mend the surface, or check the landmarks that orient the head"
+            "rough there, or the clamp is in the way; extend or mend the surface, or check the landmarks that orient the head"
         )
     return empty
 
@@ -260,7 +267,9 @@ def _directions(name: str, side: int, radius_deg: float) -> tuple[Array, list[tu
     return rays, places
 
 
-def _spots_for(surface: Surface, head_to_ras: Array, center: Array, reach: float, name: str, side: int) -> list[_Spot]:
+def _spots_for(
+    surface: Surface, head_to_ras: Array, center: Array, reach: float, name: str, side: int, clamp: Optional[npt.ArrayLike]
+) -> list[_Spot]:
     """Places of a window where a probe can stand; the window grows until it holds some, or is left empty."""
     for radius_deg in WINDOW_RADII_DEG:
         rays, places = _directions(name, side, radius_deg)
@@ -274,7 +283,7 @@ def _spots_for(surface: Surface, head_to_ras: Array, center: Array, reach: float
         kept = [place for place, flag in zip(places, seen) if flag]
         spots = [
             _Spot(positions[k], normals[k], kept[k], 0.02 * float(np.hypot(*kept[k])) + 0.5 * float(roughness[k]))
-            for k in np.flatnonzero(good)
+            for k in np.flatnonzero(good & clear_of_clamp(positions, normals, clamp))
         ]
         if spots:
             return spots

@@ -12,9 +12,9 @@ from CranioNavLib import host, scene, scene_data
 from CranioNavLib.errors import InputError
 from CranioNavLib.panel import Level, StepState
 from CranioNavLib.parameters import Parameters
-from CranioNavLib.rigid import rigid, rigid_from_vector
+from CranioNavLib.rigid import invert_rigid, rigid, rigid_from_vector, transform_points
 from CranioNavLib.sequence_metafile import Acquisition, Recording, read_recording
-from CranioNavLib.slicer_files import load_scene, save_scene
+from CranioNavLib.slicer_files import LabelledPoints, load_scene, save_scene
 from CranioNavLib.surface import Surface
 from ModuleUltrasoundLib import panel_description as module_panel
 from ModuleUltrasoundLib.devices.device import AMODE_DEVICES, AModeDevice, RfLine
@@ -361,6 +361,33 @@ def test_a_point_where_the_reference_base_stands_is_asked_for_last(a_recording_l
     scene_data.set_transform("ReferenceToRas", base)
     logic.beginAsking()
     assert logic.currentIndex() != first
+
+
+def test_a_point_beside_a_pin_of_the_clamp_is_asked_for_last_and_planned_elsewhere(a_recording_logic):
+    logic = a_recording_logic
+    know_the_error(logic)
+    first, positions = logic.currentIndex(), logic.protocolPoints()[0]
+    assert logic.clampPins().text.startswith("no pins known")
+    reference_to_ras = rigid_from_vector([0.4, -0.2, 1.1], [20.0, 300.0, -40.0])
+    pins = transform_points(invert_rigid(reference_to_ras), positions[first : first + 1])
+    scene_data.set_points("ClampPins", LabelledPoints(("C1",), pins))
+    scene_data.set_transform("ReferenceToRas", reference_to_ras)
+    assert logic.clampPins().text == "1 pin; the probe keeps 30 mm away"
+    logic.beginAsking()
+    assert logic.currentIndex() != first
+    logic.planProtocol()
+    assert np.linalg.norm(logic.protocolPoints()[0] - positions[first], axis=1).min() >= 30.0
+
+
+def test_pins_touched_before_there_is_a_registration_wait_for_it(a_logic, a_head):
+    scene_data.set_surface("OuterTable", a_head)
+    a_logic.planProtocol()
+    free = a_logic.protocolPoints()[0]
+    scene_data.set_points("ClampPins", LabelledPoints(("C1", "C2"), free[:2]))
+    assert a_logic.clampPins().level is Level.WARNING
+    assert a_logic.clampPins().text.startswith("2 pins; ")
+    a_logic.planProtocol()
+    np.testing.assert_array_equal(a_logic.protocolPoints()[0], free)
 
 
 def test_a_gliding_probe_leaves_points_on_its_way_and_asks_for_none(a_recording_logic, tmp_path):

@@ -7,6 +7,7 @@ import pytest
 from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import invert_rigid, rigid_from_vector, transform_directions, transform_points
 from CranioNavLib.surface import Surface
+from ModuleUltrasoundLib.palpation.clamp import clear_of_clamp
 from ModuleUltrasoundLib.palpation.protocol import LANDMARK_LABELS, REGIONS, _first_dip, plan_protocol, probe_footprint
 
 COUNTS = {"Left lateral": 3, "Right lateral": 3, "Frontal convexity": 4, "Forehead": 4, "Periorbital": 4}
@@ -132,6 +133,16 @@ def test_over_a_craniotomy_no_point_is_planned_and_the_missing_ones_are_named(a_
     assert set(plan.labels) | set(plan.left_out) == set(whole.labels)
     assert len(plan) == 18 - len(plan.left_out)
     assert not whole.left_out
+
+
+def test_points_keep_clear_of_the_pins_of_the_head_clamp(a_skull):
+    free = plan_protocol(a_skull, LANDMARKS)
+    pins = free.positions_ras_mm[[free.labels.index(label) for label in ("Left lateral 1", "Right lateral 1", "Right lateral 2")]]
+    plan = plan_protocol(a_skull, LANDMARKS, clamp_ras_mm=pins)
+    assert clear_of_clamp(plan.positions_ras_mm, plan.normals, pins).all()
+    assert len(plan) == 18 - len(plan.left_out)
+    assert set(plan.labels) | set(plan.left_out) == set(free.labels)
+    assert len(plan.left_out) <= 1, "a window that holds a pin is widened"
 
 
 def test_an_open_face_without_the_back_of_the_head_is_enough():

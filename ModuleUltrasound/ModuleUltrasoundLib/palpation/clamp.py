@@ -1,0 +1,34 @@
+"""The head clamp: where a probe would run into its pins or arms."""
+
+from __future__ import annotations
+
+from typing import Optional
+
+import numpy as np
+import numpy.typing as npt
+from CranioNavLib.rigid import Array, check_points
+
+PROBE_LENGTH_MM = 150.0  # what a probe with the hand takes up outside the head
+CLEARANCE_MM = 30.0  # between the probe's axis and a pin: half a hand's width
+
+
+def clear_of_clamp(
+    feet_mm: Array, normals: Array, clamp_mm: Optional[npt.ArrayLike], clearance_mm: float = CLEARANCE_MM
+) -> npt.NDArray[np.bool_]:
+    """(N,) whether a probe that stands square on the bone keeps its distance from every point of the clamp.
+
+    Parameters
+    ----------
+    feet_mm, normals : arrays, shape (N, 3)
+        Where it stands, and the outward unit normals along which it is held.
+    clamp_mm : array-like, shape (K, 3), or None
+        Points on the clamp (pins, arms), in the same frame.
+    clearance_mm : float
+        Least distance from the probe's axis, which is `PROBE_LENGTH_MM` long.
+    """
+    if clamp_mm is None:
+        return np.ones(len(feet_mm), dtype=bool)
+    away = check_points(clamp_mm, "points on the clamp")[None] - feet_mm[:, None]  # (N, K, 3)
+    along = np.clip(np.sum(away * normals[:, None], axis=2), 0.0, PROBE_LENGTH_MM)
+    gaps = np.linalg.norm(away - along[:, :, None] * normals[:, None], axis=2)
+    return np.asarray(gaps.min(axis=1, initial=np.inf) >= clearance_mm)
