@@ -46,7 +46,9 @@ class AskStep(ProbeStep):
         candidates = within if within.any() else candidates
         if not candidates.any():
             return
-        self._brings = self._best(plan, candidates, [point.target for point in palpation.taken])
+        registered_with = scene_data.get_points("RegisteredPoints").labels if count_of("RegisteredPoints") else ()
+        since = [point.target for point in palpation.taken if point.label not in registered_with]
+        self._brings = self._best(plan, candidates, since)
         if self._brings is not None:
             self.goTo(self._brings.index)
             return
@@ -86,15 +88,15 @@ class AskStep(ProbeStep):
         clamp = clamp if pins is None else np.concatenate([pins, clamp])
         return reachable(plan, clamp, TOWARDS_TABLE[self.parameters().read().patient_lies])
 
-    def _best(self, plan: ProtocolPoints, candidates: npt.NDArray[np.bool_], taken: list[int]) -> Optional[NextTarget]:
-        """By the error of the registration in force, with the points taken since counted in; None where it is not known."""
+    def _best(self, plan: ProtocolPoints, candidates: npt.NDArray[np.bool_], since: list[int]) -> Optional[NextTarget]:
+        """By the error of the registration in force, with the points taken since it counted in; None where it is not known."""
         from ModuleUltrasoundLib.palpation.next_point import DEFAULTS, choose_next, covariance_with
 
         error = scene_data.get_motion_error() if registered() else None
         if error is None:
             return None
         covariance, pivot, _ = error
-        for index in taken:
+        for index in since:
             covariance = covariance_with(
                 covariance, plan.positions_ras_mm[index], plan.normals[index], pivot, DEFAULTS.point_sd_mm
             )

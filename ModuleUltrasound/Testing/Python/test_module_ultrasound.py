@@ -22,6 +22,7 @@ from ModuleUltrasoundLib.emulators.amode_serial import SerialPulser
 from ModuleUltrasoundLib.emulators.faults import Faults
 from ModuleUltrasoundLib.emulators.line_source import RecordedLines
 from ModuleUltrasoundLib.emulators.server import served
+from ModuleUltrasoundLib.palpation.next_point import rms_tre_mm
 from ModuleUltrasoundLib.palpation.palpation import PalpationLine
 
 import ModuleUltrasound as module
@@ -336,6 +337,19 @@ def test_the_point_that_shrinks_the_error_most_is_asked_for_first(a_recording_lo
         logic.nextPoint()
         asked.add(logic.currentIndex())
     assert asked == set(range(18))  # each once, before one that was left out is asked for again
+
+
+def test_points_that_the_registration_was_made_of_are_not_counted_in_once_more(a_recording_logic):
+    logic, (positions, _, labels) = a_recording_logic, a_recording_logic.protocolPoints()
+    know_the_error(logic)
+    first = logic.currentIndex()
+    logic.takePoints(lines_on(logic, first, time.monotonic()))
+    assert logic.taken() == [labels[first]]
+    in_force = float(rms_tre_mm(np.diag([0.05, 0.002, 0.002, 0.3, 0.3, 0.3]) ** 2, np.zeros(3), positions))
+    assert float(logic.brings().text.split(" → ")[0]) < in_force - 0.1
+    scene_data.set_points("RegisteredPoints", LabelledPoints((labels[first],), positions[[first]]))
+    logic.askNext()
+    assert float(logic.brings().text.split(" → ")[0]) == pytest.approx(in_force, abs=0.06)
 
 
 def test_points_that_the_table_hides_are_asked_for_last(a_recording_logic):
