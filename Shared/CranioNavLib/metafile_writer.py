@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping, Sized
+from collections.abc import Collection, Iterator, Mapping, Sized
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Optional
@@ -150,8 +150,11 @@ class RecordingWriter:
         self.count += 1
         self._last_time = timestamp_s
 
-    def close(self) -> None:
-        """Join fields and pixels into one file; may be called twice. A recording without frames leaves no file."""
+    def close(self, invalid: Collection[int] = ()) -> None:
+        """Join fields and pixels into one file; may be called twice. A recording without frames leaves no file.
+
+        The frames `invalid` get the ImageStatus INVALID: their lines are kept, and never become points.
+        """
         if self._fields is None:
             return
         empty = self.count == 0 and os.fstat(self._fields).st_size == 0
@@ -165,7 +168,7 @@ class RecordingWriter:
         if self.count == 0:
             self._raw_path.unlink(missing_ok=True)
         elif not joined:
-            recover(self.path)
+            recover(self.path, invalid)
 
     def __enter__(self) -> RecordingWriter:
         return self
@@ -174,8 +177,10 @@ class RecordingWriter:
         self.close()
 
 
-def recover(path: str | Path) -> int:
+def recover(path: str | Path, invalid: Collection[int] = ()) -> int:
     """Finish an interrupted recording: join the pixels beside `path` into it. Returns the number of frames.
+
+    The frames `invalid` get the ImageStatus INVALID.
 
     Raises
     ------
@@ -196,6 +201,9 @@ def recover(path: str | Path) -> int:
     try:
         with written_whole(target) as temporary, temporary.open("wb") as file:
             for line in _lines_of_frames(target, count):
+                done = FRAME_DONE.fullmatch(line)
+                if done and int(done[1]) in invalid:
+                    file.write(b"Seq_Frame%s_ImageStatus = INVALID\n" % done[1])
                 file.write(_dim_size(samples, count) if line.startswith(b"DimSize") else line)
             file.write(b"ElementDataFile = LOCAL\n")
             with raw.open("rb") as pixels:

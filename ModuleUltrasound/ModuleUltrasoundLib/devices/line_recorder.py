@@ -24,6 +24,9 @@ class LineRecorder:
     def __init__(self, path: str, first: RfLine, acquisition: Acquisition) -> None:
         self.start_s = first.host_time_s
         self.points: set[int] = set()  # of the protocol, with a pose
+        self._frames: dict[int, list[int]] = {}  # of each point
+        self._taken_back: dict[int, float] = {}  # when a point was
+        self._invalid: set[int] = set()  # frames of points taken back
         self._writer = RecordingWriter(path, len(first.samples), acquisition)
 
     @property
@@ -35,17 +38,27 @@ class LineRecorder:
         """Write a line; where it has no pose its status tells why."""
         if item.line.host_time_s <= self.start_s and self.lines:
             return
-        pose = item.pose
+        pose, point = item.pose, item.palpation_point
+        if item.line.host_time_s < self._taken_back.get(point, 0.0):
+            self._invalid.add(self.lines)
+        else:
+            self._frames.setdefault(point, []).append(self.lines)
         self._writer.append(
             max(0.0, item.line.host_time_s - self.start_s),
             {"ProbeToReference": pose.tool_to_tracker if pose.usable else None},
             {"ProbeToReference": "OK" if pose.usable else status_word(pose.status)},
             item.line.samples,
-            item.palpation_point,
+            point,
         )
         if pose.usable:
-            self.points.add(item.palpation_point)
+            self.points.add(point)
+
+    def take_back(self, point: int, host_time_s: float) -> None:
+        """The lines of a point up to now are none of it: they stay in the file, marked as invalid when it is finished."""
+        self._invalid.update(self._frames.pop(point, ()))
+        self._taken_back[point] = host_time_s
+        self.points.discard(point)
 
     def close(self) -> None:
         """Finish the file."""
-        self._writer.close()
+        self._writer.close(self._invalid)

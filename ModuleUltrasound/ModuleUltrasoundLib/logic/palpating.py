@@ -35,6 +35,7 @@ class PalpationStep(SweepStep, MeasureStep):
         self.recorder: Optional[LineRecorder] = None
         self._palpated: Optional[PalpationStatus] = None  # its last status
         self._rests: Optional[tuple[int, Array]] = None  # the point just taken, and where the probe stood then (Reference)
+        self._restsUntil = np.inf  # it was taken back: from then on the probe is where it is asked to be
 
     def goTo(self, index: int) -> None:
         """Ask for a point; where it is expected on the patient follows from the registration, once there is one."""
@@ -89,7 +90,7 @@ class PalpationStep(SweepStep, MeasureStep):
         for item in posed:
             if self._rests is not None and item.pose.usable:
                 away_mm = float(np.linalg.norm(_origin(item) - self._rests[1]))
-                self._rests = self._rests if away_mm < LEFT_MM else None
+                self._rests = self._rests if away_mm < LEFT_MM and item.line.host_time_s < self._restsUntil else None
             if self._rests is not None and item.palpation_point >= 0:
                 item = replace(item, palpation_point=self._rests[0])
             self.recorder.add(item)
@@ -129,7 +130,7 @@ class PalpationStep(SweepStep, MeasureStep):
                 new = True
                 point = self._palpated.new_point
                 tip_mm = self.running.acquisition.forerun_length_mm + point.line.depth_mm
-                self._rests = (point.target, point.line.position_mm - tip_mm * point.line.beam)
+                self._rests, self._restsUntil = (point.target, point.line.position_mm - tip_mm * point.line.beam), np.inf
                 self.askNext()
         if new:
             self._showTaken(self.palpation)
@@ -146,11 +147,14 @@ class PalpationStep(SweepStep, MeasureStep):
         scene_data.set_bone_points(to_bone_points(lines, labels, wanted.speed_of_sound_m_s, wanted.speed_of_sound_sd_m_s))
 
     def undoPoint(self) -> Optional[str]:
-        """Take back the last point and return to it. Returns a message."""
+        """Take back the last point, in the recording too, and return to it. Returns a message."""
         point = self.palpation.undo() if self.palpation is not None else None
         if point is None or self.palpation is None:
             return None
         self.goTo(point.target)
+        self._restsUntil = self._changes[-1][0]
+        if self.recorder is not None:
+            self.recorder.take_back(point.target, self._changes[-1][0])
         self._showTaken(self.palpation)
         return f"{point.label} taken back"
 

@@ -246,7 +246,7 @@ def a_recording_logic(a_logic, a_head, tmp_path):
     return a_logic
 
 
-def test_resting_on_a_point_takes_it_and_asks_for_the_next(a_recording_logic):
+def test_resting_on_a_point_takes_it_and_asks_for_the_next(a_recording_logic, tmp_path):
     logic = a_recording_logic
     first, label = logic.protocolPoints()[0][0], logic.protocolPoints()[2][0]
     end = time.monotonic() + 60
@@ -259,8 +259,15 @@ def test_resting_on_a_point_takes_it_and_asks_for_the_next(a_recording_logic):
     assert taken.has_beam.all()
     assert "1 of 18" in logic.dwell().text
     assert logic.undoPoint() == f"{label} taken back"
+    undone_s = time.monotonic() - logic.recorder.start_s
     assert logic.currentIndex() == 0
     assert scene.find("SurfacePoints") is None
+    run_for(logic, 0.4, on_point(logic, 0))
+    logic.closeRecording()
+    recording = read_recording(tmp_path / "r.igs.mha")
+    before = recording.timestamps_s < undone_s
+    assert not any(status == "OK" for status, early in zip(recording.statuses, before) if early), "those of the point taken back"
+    assert any(status == "OK" for status, early in zip(recording.statuses, before) if not early)
 
 
 def test_lines_of_a_probe_that_still_rests_on_a_taken_point_are_not_the_next_points(a_recording_logic, tmp_path):
