@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Annotated, Optional
 
-from CranioNavLib.panel import Action, FileField, NodeField, Panel, ParameterField, PluginField, ReadOut, Step
+from CranioNavLib.panel import Action, FileField, NodeField, Panel, ParameterField, Picture, PluginField, ReadOut, Step
 from CranioNavLib.parameters import Limits, Parameters
 
 from ModuleUltrasoundLib.devices.device import AMODE_DEVICES
@@ -102,6 +102,7 @@ PANEL = Panel(
                 ReadOut("probePose", "Probe's pose"),
                 ReadOut("depth", "Bone depth", "mm", large=True),
                 ReadOut("quality", "Echo quality (0..1)"),
+                Picture("aLine", "The last line, with skin and bone; the light band is the gate", on_page=False),
             ),
             status="deviceStatus",
         ),
@@ -115,6 +116,7 @@ PANEL = Panel(
                 Action("startRecording", "Record", "Begin to record lines and poses", primary=True),
                 Action("stopRecording", "Stop the recording", "Finish the file and measure it"),
                 ReadOut("guidance", "Do now", large=True),
+                Picture("bullsEye", "Where the probe's back end stands off the upright, seen from outside", on_page=False),
                 ReadOut("brings", "Predicted error with this point", "mm"),
                 ReadOut("tilt", "Tilt off the upright", "°", large=True),
                 ReadOut("dwell", "Taken"),

@@ -168,6 +168,7 @@ class Picture:
 
     name: str
     label: str
+    on_page: bool = True  # False: the web page has a larger one of its own
 
 
 Field = Union[ParameterField, FileField, PluginField, ListField]

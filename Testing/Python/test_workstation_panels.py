@@ -94,7 +94,7 @@ def test_everything_described_is_drawn(an_empty_scene, name):
         elif isinstance(item, NodeField):
             assert f"panel.nodes['{item.role}']" in page
         elif isinstance(item, Picture):
-            assert f'data-picture="{item.name}"' in page
+            assert (f'data-picture="{item.name}"' in page) is item.on_page
         elif isinstance(item, ListField):
             assert f'data-list="{item.name}"' in page
         else:

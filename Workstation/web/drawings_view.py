@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from ModuleUltrasoundLib.live_drawings import HEIGHT, WIDTH
 from trame.widgets import html
 
 from Workstation.web import words
-from Workstation.web.drawings import HEIGHT, WIDTH
 
 GOOD, WARNING, BLUE = "#2fbf8f", "#f0b429", "#6cb8f0"
 A_LINE = f"""

@@ -31,7 +31,7 @@ def panel_state(model: PanelModel) -> dict[str, Any]:
             node = model.node(item)
             nodes[item.role] = node.GetName() if node is not None else "not there yet"
         elif isinstance(item, Picture):
-            pictures[item.name] = model.drawing(item) or ""
+            pictures[item.name] = (model.drawing(item) or "") if item.on_page else ""
         else:
             if isinstance(item, ListField):
                 lists[item.name] = [asdict(one) for one in model.entries(item)]

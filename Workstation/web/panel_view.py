@@ -118,6 +118,8 @@ class PanelView:
             self._draw_plugin(item)
         elif isinstance(item, ListField):
             self._draw_list(item)
+        elif isinstance(item, Picture) and not item.on_page:
+            return
         elif isinstance(item, Picture):
             html.Div(
                 v_html=f"{self.key}.pictures['{item.name}']",

@@ -15,6 +15,7 @@ from ModuleUltrasoundLib.devices.device import AModeDevice
 from ModuleUltrasoundLib.devices.line_batches import LineBatch, LineBatches
 from ModuleUltrasoundLib.devices.line_stream import LinePoser, LineStream, PosedLine
 from ModuleUltrasoundLib.devices.linked_device import LinkedDevice
+from ModuleUltrasoundLib.live_drawings import a_line, bulls_eye, draw_a_line, draw_bulls_eye
 from ModuleUltrasoundLib.logic.planning import ProtocolStep, registered
 
 if TYPE_CHECKING:
@@ -160,6 +161,16 @@ class ProbeStep(ProtocolStep):
     def guide(self) -> Optional[Guide]:
         """Where the probe stands to the current point; None without a registration or a live probe."""
         return self._guide
+
+    def aLine(self) -> Optional[str]:
+        """A drawing of the last line with what was found in it; None without one."""
+        line = a_line(self.live(), self.parameters().read().echo_settings())
+        return draw_a_line(line) if line is not None else None
+
+    def bullsEye(self) -> Optional[str]:
+        """A drawing of the probe's tilt; None without a registration or a live probe."""
+        eye = bulls_eye(self._guide, self.live())
+        return draw_bulls_eye(eye) if eye is not None else None
 
     def connection(self) -> Reading:
         """Connected, or why not."""

@@ -452,6 +452,8 @@ def test_guidance_tells_the_tilt_under_the_registration(a_recording_logic):
     run_for(logic, 0.6, on_point(logic, 5))
     assert float(logic.tilt().text) < 2.0
     assert logic.guidance().level is Level.GOOD
+    assert logic.bullsEye().startswith("<svg")
+    assert logic.aLine().startswith("<svg")
     run_for(logic, 0.6, on_point(logic, 5, tilt_deg=12.0))
     assert float(logic.tilt().text) == pytest.approx(12.0, abs=1.5)
     assert logic.guidance().level is Level.WARNING
@@ -461,4 +463,5 @@ def test_without_a_registration_there_is_no_guidance(a_recording_logic):
     scene.find("ReferenceToRas").RemoveAttribute(scene.STATUS_ATTRIBUTE)
     run_for(a_recording_logic, 0.6, on_point(a_recording_logic, 0))
     assert a_recording_logic.guidance() is None
+    assert a_recording_logic.bullsEye() is None
     assert a_recording_logic.tilt() is None
