@@ -22,8 +22,8 @@ import numpy.typing as npt
 from CranioNavLib.sequence_metafile import Acquisition, Recording
 from ModuleUltrasoundLib.measurement.measure import EchoSettings, measure_lines
 
-from Testing.Studies import bench_lines, page_lines, plain_lines, tissue_lines
-from Testing.Studies.echo_lines import draw_world, simulate
+from Testing.Studies.simulators import bench_lines, page_lines, plain_lines, tissue_lines
+from Testing.Studies.simulators.echo_lines import draw_world, simulate
 
 Array = npt.NDArray[np.float64]
 FRAMES = 40

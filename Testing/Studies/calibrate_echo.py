@@ -28,8 +28,8 @@ from ModuleUltrasoundLib.echo.search import Found, search_lines
 from ModuleUltrasoundLib.measurement.measure import EchoSettings, measure_lines, several_spots, stays
 from ModuleUltrasoundLib.measurement.quality import TOLERANCE_MM
 
-from Testing.Studies import bench_lines, echo_lines, page_lines, plain_lines, tissue_lines
 from Testing.Studies.fit_network import Lines, fit, joined
+from Testing.Studies.simulators import bench_lines, echo_lines, page_lines, plain_lines, tissue_lines
 
 Array = npt.NDArray[np.float64]
 # Recordings of each family, of the number asked for: in a water bath there is less to learn

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import hilbert
 
 from Testing.Benchmarks.echo import calibration, measure_world, rates
-from Testing.Studies import session_lines
+from Testing.Studies.simulators import session_lines
 
 
 @pytest.mark.slow

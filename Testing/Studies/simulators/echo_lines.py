@@ -13,7 +13,7 @@ import numpy.typing as npt
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition, Recording
 
-from Testing.Studies.line_truth import Truth
+from Testing.Studies.simulators.line_truth import Truth
 
 Array = npt.NDArray[np.float64]
 

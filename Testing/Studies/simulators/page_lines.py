@@ -16,7 +16,7 @@ from CranioNavLib.recording import Acquisition, Recording
 from CranioNavLib.rigid import rigid_from_vector
 from scipy.signal import fftconvolve
 
-from Testing.Studies.line_truth import Truth
+from Testing.Studies.simulators.line_truth import Truth
 
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from CranioNavLib.recording import Acquisition, Recording
 from CranioNavLib.rigid import rigid_from_vector
 
-from Testing.Studies.line_truth import Truth
+from Testing.Studies.simulators.line_truth import Truth
 
 Array = npt.NDArray[np.float64]
 

@@ -13,8 +13,8 @@ import numpy.typing as npt
 import scipy.fft
 from CranioNavLib.recording import Recording
 
-from Testing.Studies.line_truth import Truth
-from Testing.Studies.session_plan import (
+from Testing.Studies.simulators.line_truth import Truth
+from Testing.Studies.simulators.session_plan import (
     BONE_R,
     DEPTH_MM,
     Array,
