@@ -12,7 +12,7 @@ from Testing.Studies.simulators.theatre_plan import draw_hand, draw_theatre, hol
 
 @pytest.fixture(scope="module")
 def some_sessions():
-    return [theatre_lines.simulate(np.random.default_rng(93_000_000 + index), 24) for index in range(24)]
+    return [theatre_lines.simulate(np.random.default_rng(93_000_000 + index), 20) for index in range(20)]
 
 
 def a_theatre(wanted):

@@ -51,7 +51,7 @@ class Pulse:
         self.band = slice(int(heard[0]), int(heard[-1]) + 1)
         self.spectrum = spectrum[self.band].astype(np.complex64)
         self.step_mhz = float(theatre.sampling_mhz / size)
-        self.mhz: Array = np.arange(self.band.start, self.band.stop) * self.step_mhz
+        self.mhz = np.asarray(np.arange(self.band.start, self.band.stop) * self.step_mhz, dtype=float)
 
     def around_zero(self, size: int) -> npt.NDArray[np.complex128]:
         """The pulse in `size` samples, its early half at their end."""
@@ -69,7 +69,7 @@ class Pulse:
         blocks = -(-len(self.mhz) // BLOCK)
         starts = self.mhz[0] + np.arange(blocks) * (BLOCK * self.step_mhz)
         coarse = _powers(time_us, lost, starts) * height[:, :, None].astype(np.float32)
-        fine = _powers(time_us, lost, np.arange(BLOCK) * self.step_mhz)
+        fine = _powers(time_us, lost, np.asarray(np.arange(BLOCK) * self.step_mhz, dtype=float))
         total = np.matmul(coarse.transpose(0, 2, 1), fine)
         return np.asarray(total.reshape(len(time_us), -1)[:, : len(self.mhz)])
 
