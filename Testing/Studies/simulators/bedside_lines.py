@@ -120,7 +120,7 @@ def _scene(rng: np.random.Generator, world: Bedside, way: Way) -> Scene:
     """Where the bone is, and when it answers; the lines end behind the deepest of it."""
     stand = draw_stand(rng, world, way)
     lines, bone, speed = len(way.place), way.kind == "bone", world.speed_m_s / 1e3
-    line_us = np.zeros(lines)
+    line_us: Array = np.zeros(lines)
     if world.acquisition.forerun_length_mm:
         warm = world.warming * (1 - 0.5 * np.exp(-np.arange(lines) / (2.0 * world.rate_hz)))
         line_us = 2e3 * world.acquisition.forerun_length_mm / world.acquisition.forerun_speed_m_s * (1 + warm)
@@ -172,7 +172,7 @@ def _behind(rng: np.random.Generator, scene: Scene, mirror: Array) -> Spectra:
     loss = band.loss_db(depth)
     once = height * scene.through * coupling
 
-    def inside(into_mm: float, strength: npt.ArrayLike) -> Echo:
+    def inside(into_mm: float, strength: Array) -> Echo:
         return arrival + 2 * into_mm / BONE_MM_US, once * strength, loss + BONE_LOSS_DB * into_mm
 
     into_mm = rng.uniform(0.15, 1.0, DIPLOE) * world.skull_mm
