@@ -44,8 +44,8 @@ class Band:
     def __init__(self, setup: Setup, samples: int) -> None:
         width_mhz = setup.bandwidth * setup.centre_mhz
         self.samples, self.half_us = samples, HALF_PULSE / width_mhz
-        margin = int(2 * self.half_us * setup.sampling_mhz) + 1  # what comes early or late must not come round
-        self.size = scipy.fft.next_fast_len(samples + margin, real=True)
+        # a wide band ends at frequency 0, and its transmitted pulse fades slowly: the far end must not come round into the line
+        self.size = scipy.fft.next_fast_len(2 * samples, real=True)
         every = np.arange(self.size // 2 + 1) * (setup.sampling_mhz / self.size)
         pulse = np.exp(-np.log(2) * ((every - setup.centre_mhz) / (width_mhz / 2)) ** 2)
         lost = pulse * np.exp(-0.2 * NEPER * setup.attenuation * 2 * setup.depth_mm * every)
@@ -60,7 +60,7 @@ class Band:
 
     def loss(self, depth_mm: npt.ArrayLike) -> Array:
         """What is left of the envelope's peak from a depth, where each frequency has lost its share."""
-        return np.asarray(np.exp(np.interp(depth_mm, self.depths, self.log_heights)))
+        return np.asarray(np.exp(np.interp(np.asarray(depth_mm, dtype=float), self.depths, self.log_heights)))
 
     def lines(self, spectra: npt.NDArray[np.complex64]) -> Waves:
         """Samples (n, samples) of spectra (n, K)."""

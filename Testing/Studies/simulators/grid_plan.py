@@ -184,7 +184,7 @@ class Hand:
     def turns(self) -> Bools:
         """Both lines at a change of kind."""
         changed = self.kind[1:] != self.kind[:-1]
-        return np.append(changed, False) | np.append(False, changed)
+        return np.asarray(np.append(changed, False) | np.append(False, changed))
 
 
 def draw_hand(rng: np.random.Generator, setup: Setup, frames: int) -> Hand:
@@ -209,7 +209,8 @@ def _draw_tilts(rng: np.random.Generator, setup: Setup, since: Rows) -> Array:
     keeps = np.exp(-1 / lasts)
     steps = rng.normal(0, spread * np.sqrt(1 - keeps**2), (len(since), 2))
     tilt = np.zeros((len(since), 2))
-    start, unrest = np.zeros(2), np.zeros(2)
+    start: Array = np.zeros(2)
+    unrest: Array = np.zeros(2)
     for row, number in enumerate(since):
         if number == 0 and not setup.sweeps:
             start, unrest = rng.normal(0, ASKEW_DEG, 2), np.zeros(2)
