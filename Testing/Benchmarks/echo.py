@@ -2,9 +2,8 @@
 
     python -m Testing.Benchmarks.echo --worlds 300 --seed 7
 
-The recordings are drawn like those of the calibration, from each of its families (Testing/Studies/echo_lines.py,
-tissue_lines.py, bench_lines.py, page_lines.py, and plain_lines.py, which no network is fitted to), with other seeds. Depths
-are judged with the true speed of sound given.
+The recordings are drawn like those of the calibration, from each of its families (Testing/Studies/simulators) and from
+plain_lines.py, which no network is fitted to, with other seeds. Depths are judged with the true speed of sound given.
 """
 
 from __future__ import annotations
@@ -22,7 +21,18 @@ import numpy.typing as npt
 from CranioNavLib.sequence_metafile import Acquisition, Recording
 from ModuleUltrasoundLib.measurement.measure import EchoSettings, measure_lines
 
-from Testing.Studies.simulators import bench_lines, page_lines, plain_lines, tissue_lines
+from Testing.Studies.simulators import (
+    bedside_lines,
+    bench_lines,
+    facet_lines,
+    layer_lines,
+    page_lines,
+    plain_lines,
+    range_lines,
+    session_lines,
+    theatre_lines,
+    tissue_lines,
+)
 from Testing.Studies.simulators.echo_lines import draw_world, simulate
 
 Array = npt.NDArray[np.float64]
@@ -32,6 +42,12 @@ SIMULATORS: dict[str, Callable[..., Any]] = {
     "tissue_lines": tissue_lines.simulate,
     "bench_lines": bench_lines.simulate,
     "page_lines": page_lines.simulate,
+    "session_lines": session_lines.simulate,
+    "bedside_lines": bedside_lines.simulate,
+    "facet_lines": facet_lines.simulate,
+    "theatre_lines": theatre_lines.simulate,
+    "range_lines": range_lines.simulate,
+    "layer_lines": layer_lines.simulate,
     "plain_lines": plain_lines.simulate,
 }
 FAMILIES = ("echo_lines", *SIMULATORS)

@@ -2,11 +2,12 @@
 
     python -m Testing.Studies.calibrate_echo --worlds 4400 --seed 30 [--cache DIR]
 
-The recordings come from four families of simulated lines (echo_lines.py, tissue_lines.py, bench_lines.py, page_lines.py),
-which share no model, and fewer from a water bath, where there is bone and nothing else; each recording has its own pulse,
-transducer, forerun, tissue, noise and clutter. A tenth of the recordings is kept out of the fit; they judge it,
-and on them and on a family that nothing is fitted to (plain_lines.py) the stated quality is mapped to the share of depths
-that were right. The same seed gives the same table; the one in the repository says in its note what it was fitted to.
+The recordings come from families of simulated lines that share no model (Testing/Studies/simulators). Four are drawn to be hard,
+one is a water bath, where there is bone and nothing else, and six go as a palpation session does: the hand comes down, searches
+the perpendicular, holds, lifts. Each recording has its own pulse, transducer, forerun, tissue, noise and clutter. A tenth of
+the recordings is kept out of the fit; they judge it, and on them and on a family that nothing is fitted to (plain_lines.py) the
+stated quality is mapped to the share of depths that were right. The same seed gives the same table; the one in the repository
+says in its note what it was fitted to.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,15 +27,38 @@ from CranioNavLib.recording import Recording
 from ModuleUltrasoundLib.echo.likelihood import shared_features
 from ModuleUltrasoundLib.echo.network import WEIGHTS, Likelihood, Network, probabilities, write_likelihood
 from ModuleUltrasoundLib.echo.search import Found, search_lines
-from ModuleUltrasoundLib.measurement.measure import EchoSettings, measure_lines, several_spots, stays
+from ModuleUltrasoundLib.measurement.measure import EchoSettings, measure_lines, places_of, stays
 from ModuleUltrasoundLib.measurement.quality import TOLERANCE_MM
 
 from Testing.Studies.fit_network import Lines, fit, joined
-from Testing.Studies.simulators import bench_lines, echo_lines, page_lines, plain_lines, tissue_lines
+from Testing.Studies.simulators import (
+    bedside_lines,
+    bench_lines,
+    echo_lines,
+    facet_lines,
+    layer_lines,
+    page_lines,
+    plain_lines,
+    range_lines,
+    session_lines,
+    theatre_lines,
+    tissue_lines,
+)
 
 Array = npt.NDArray[np.float64]
-# Recordings of each family, of the number asked for: in a water bath there is less to learn
-FAMILIES = {"echo_lines": 1.0, "tissue_lines": 1.0, "bench_lines": 1.0, "bare_lines": 0.25, "page_lines": 1.0}
+OTHERS: dict[str, Any] = {"bench_lines": bench_lines, "page_lines": page_lines, "plain_lines": plain_lines}
+SESSIONS: dict[str, Any] = {  # as they go on a head: their lines follow each other
+    "session_lines": session_lines,
+    "bedside_lines": bedside_lines,
+    "facet_lines": facet_lines,
+    "theatre_lines": theatre_lines,
+    "range_lines": range_lines,
+    "layer_lines": layer_lines,
+}
+# Recordings of each family, of the number asked for: in a water bath there is less to learn, and exact physics takes its time
+FAMILIES = {"echo_lines": 1.0, "tissue_lines": 1.0, "bench_lines": 1.0, "bare_lines": 0.25, "page_lines": 1.0} | {
+    name: 1.0 if name == "session_lines" else 0.25 for name in SESSIONS
+}
 TURNS = 2  # networks: a line by itself, then with the recording around it; a third adds little and costs a tenth of the time
 LABEL_MM = 0.4  # a candidate this near to the bone stands for it
 LATE_CYCLES = 1.2  # without a forerun echo the peak of a pulse that rises at its arrival comes later; corrected afterwards
@@ -74,15 +99,14 @@ def simulate_world(family: str, seed: int) -> Simulated:
     frames = int(rng.choice([1, 4, 12, 24, 40], p=[0.1, 0.15, 0.25, 0.3, 0.2]))
     if family == "echo_lines":
         recording, truth, _ = echo_lines.simulate(rng, frames, without_bone=float(rng.choice([0.1, 0.3, 0.6])))
-    elif family == UNSEEN:
-        recording, truth, _ = plain_lines.simulate(rng, frames * 3 // 2)
-    elif family == "page_lines":
-        recording, truth, _ = page_lines.simulate(rng, frames * 3 // 2)
-    elif family in ("bench_lines", "bare_lines"):
-        bench = bench_lines.draw_bare(rng) if family == "bare_lines" else None
-        recording, truth, _ = bench_lines.simulate(rng, frames * 3 // 2, bench)
-    else:
+    elif family == "tissue_lines":
         recording, truth, _ = tissue_lines.simulate(rng, frames)
+    elif family == "bare_lines":
+        recording, truth, _ = bench_lines.simulate(rng, frames * 3 // 2, bench_lines.draw_bare(rng))
+    elif family in SESSIONS:
+        recording, truth, _ = SESSIONS[family].simulate(rng, max(frames, 8) * 3 // 2)
+    else:
+        recording, truth, _ = OTHERS[family].simulate(rng, frames * 3 // 2)
     assumed = truth.speed_m_s if rng.random() < 0.8 else float(rng.uniform(1450, 1630))
     return Simulated(family, recording, truth.depth_mm, truth.tilt_deg, truth.snr_db, truth.speed_m_s, assumed)
 
@@ -90,7 +114,7 @@ def simulate_world(family: str, seed: int) -> Simulated:
 def search_world(one: Simulated) -> World:
     """Search a recording and label its candidates: the strongest near the bone stands for it."""
     runs = stays(one.recording)
-    found = search_lines(one.recording, one.assumed_m_s, (1.4, 20.0), several_spots(one.recording, runs))
+    found = search_lines(one.recording, one.assumed_m_s, (1.4, 20.0), places_of(one.recording, runs))
     off = found.depths_mm - one.true_mm[:, None] * one.assumed_m_s / one.speed_m_s
     late = LATE_CYCLES / one.recording.acquisition.transducer_hz * 500 * one.assumed_m_s
     late_mm = np.where(found.forerun.measured, 0.0, late)[:, None]

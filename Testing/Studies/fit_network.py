@@ -13,6 +13,7 @@ Floats = npt.NDArray[np.float32]
 HIDDEN = (64, 32)
 SHIFT = 0.1  # SD of what is added to a recording's features, anew in each epoch: another simulator, or a patient, is a bit off
 BATCH = 512
+NONE_WEIGHT = 3.0  # of a line without bone over one with it: a false point misleads, a missed one is asked for again
 RATE, DECAY = 3e-3, 0.01
 
 
@@ -83,6 +84,7 @@ def _gradients(
     chance = np.exp(scores - scores.max(axis=1, keepdims=True))
     chance /= chance.sum(axis=1, keepdims=True)
     chance[np.arange(count), labels] -= 1
+    chance *= np.where(labels == candidates, NONE_WEIGHT, 1.0).astype(np.float32)[:, None]
     delta = (np.where(valid, chance[:, :-1], 0) / count).reshape(-1, 1).astype(np.float32)
     by_weight: list[Floats] = []
     by_bias: list[Floats] = []

@@ -47,6 +47,7 @@ class Candidates:
     rise_db: Array  # (n, K) the echo over the level at its own front foot
     fall_db: Array  # (n, K) the echo over the level at its own rear foot: a lasting pulse or a lump of echoes falls slowly
     end_db: Array  # (n, K) level of the line's end over its quietest stretch: a receiver may amplify with depth
+    static: Array  # (n, K) 0 to 1: how far it is an echo of the probe, the same at all places
     noise: Array  # (n,) standard deviation of one quadrature
 
     @property
@@ -259,6 +260,7 @@ def _describe(
         before_all_db=under[2].T,
         after_all_db=under[3].T,
         end_db=under[4].T,
+        static=np.zeros(samples.shape),
         noise=noise,
     )
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from CranioNavLib.rigid import Array
 from CranioNavLib.sequence_metafile import Acquisition
 
@@ -24,6 +25,9 @@ LIKELY = 0.015  # SD of the same: a delay line warmed by 10 degrees; a film or l
 LEAST_SNR = 6.0  # envelope peak over the noise of one quadrature
 SAME_S = 1e-7  # lines of one recording show the face this near to each other
 LEAST_SHARE = 0.4  # of a batch's lines must show it
+CLEAR, LEAST_CLEAR = 10.0, 3  # or so many show it this far over what is behind: in air, where all sound comes back from the face
+LEAST_AGREEING = 0.8  # of those that show it so clearly
+DRIFT = 0.02  # of the nominal time: how far a delay line moves within a recording
 CONTRAST = 6.0  # of the echo over the mean level behind it; speckle seldom reaches 4
 CONTRAST_EXPECTED = 3.0  # the same where the header says that the echo should be
 BEHIND_S = 3e-6
@@ -59,7 +63,7 @@ def find_forerun(envelopes: Envelopes, magnitude: npt.NDArray[np.float32], noise
 
     An echo is believed if it stands out of what follows (tissue begins there, and its speckle must not be taken for the face)
     and lies where the other lines of the batch show it. Lines in which it is too weak get the others' median; if most lines
-    lack it, all get the nominal time.
+    lack it, a few that show it very clearly (in air) will do; without them all get the nominal time.
     """
     nominal = nominal_skin_s(acquisition)
     count, length = magnitude.shape
@@ -88,13 +92,30 @@ def find_forerun(envelopes: Envelopes, magnitude: npt.NDArray[np.float32], noise
     found = inside & (heights > LEAST_SNR * noise) & (heights > np.where(expected, CONTRAST_EXPECTED, CONTRAST) * behind)
     if not found.any():
         return nothing
-    middle = median(times[found])
-    found &= np.abs(times - middle) < SAME_S
+    clear = found & (heights > CLEAR * behind)
+    found &= np.abs(times - median(times[found])) < SAME_S
     if found.sum() < LEAST_SHARE * count:
+        found = _agreeing(times, clear, nominal)
+    if not found.any():
         return nothing
     middle = median(times[found])
     sd = np.where(found, widths / rate * noise / np.maximum(heights, 1e-9), SAME_S / 2)
     return Forerun(np.where(found, times, middle), np.where(found, heights, 0.0), found, ~false, sd, heights)
+
+
+def _agreeing(times: Array, clear: npt.NDArray[np.bool_], nominal_s: float) -> npt.NDArray[np.bool_]:
+    """The `clear` lines (n,) if they show one face, whose time (s) at most drifts; none if they are few or differ."""
+    seen = np.flatnonzero(clear)
+    if len(seen) < LEAST_CLEAR:
+        return np.zeros_like(clear)
+    typical = scipy.ndimage.median_filter(times[seen], size=2 * LEAST_CLEAR - 1, mode="nearest")
+    near = np.abs(times[seen] - typical) < SAME_S
+    agreeing = np.zeros_like(clear)
+    if near.sum() < max(LEAST_CLEAR, LEAST_AGREEING * len(seen)) or np.ptp(typical) > SAME_S + DRIFT * nominal_s:
+        return agreeing
+    if np.abs(np.diff(typical)).max() < SAME_S:
+        agreeing[seen[near]] = True
+    return agreeing
 
 
 def steady(forerun: Forerun) -> Forerun:
@@ -104,9 +125,18 @@ def steady(forerun: Forerun) -> Forerun:
     the line's own and is kept. Each time is drawn to its neighbours' mean by the share that noise has in the scatter.
     """
     seen = np.flatnonzero(forerun.found)
-    if len(seen) < LEAST_LINES:
+    if not len(seen):
         return forerun
-    times, variance = forerun.skin_s[seen], forerun.sd_s[seen] ** 2
+    missing = np.flatnonzero(forerun.measured & ~forerun.found)
+    times_s, sd_s = forerun.skin_s.copy(), forerun.sd_s.copy()
+    if len(seen) >= LEAST_LINES:
+        times_s[seen], sd_s[seen] = _freed_of_noise(forerun.skin_s[seen], forerun.sd_s[seen] ** 2)
+    times_s[missing] = np.interp(missing, seen, times_s[seen])
+    return replace(forerun, skin_s=times_s, sd_s=sd_s)
+
+
+def _freed_of_noise(times: Array, variance: Array) -> tuple[Array, Array]:
+    """Times (m,) drawn to their neighbours' means, and their standard deviations."""
     weight = 1 / variance
     mean = _running(weight * times, NEIGHBOURS) / _running(weight, NEIGHBOURS)
     noise = median(variance)
@@ -114,11 +144,7 @@ def steady(forerun: Forerun) -> Forerun:
     own = max(scatter - noise, 0.0) / max(scatter, noise)  # share of the scatter that is not noise
     drawn = mean + own * (times - mean)
     rest = own**2 * variance + (1 - own) ** 2 / _running(weight, NEIGHBOURS)
-    times_s, sd_s = forerun.skin_s.copy(), forerun.sd_s.copy()
-    times_s[seen], sd_s[seen] = drawn, np.sqrt(rest)
-    missing = np.flatnonzero(forerun.measured & ~forerun.found)
-    times_s[missing] = np.interp(missing, seen, drawn)
-    return replace(forerun, skin_s=times_s, sd_s=sd_s)
+    return np.asarray(drawn), np.asarray(np.sqrt(rest))
 
 
 def _running(values: Array, reach: int) -> Array:

@@ -4,8 +4,9 @@ With a forerun echo in the line the question does not arise: both echoes share t
 Without one, depth counts from the transmit pulse, and a peak picked on a pulse that rises at the arrival is late by half a
 cycle to two cycles (0.1 to 0.4 mm). Two things tell: a main bang that shows the very pulse of the echoes, and the shape of
 the pulse: a damped oscillation rises faster than it decays, and has its origin at its onset; a symmetric pulse has its
-origin in its middle. Where neither tells, the delay is taken as zero. What is wrong in it is common to all points of
-the recording (an offset of depth that registration can estimate), so it is not part of their covariances.
+origin in its middle. Where neither tells, the delay is taken as zero; where the shape alone tells, most of it is taken.
+What is wrong in it is common to all points of the recording (an offset of depth that registration can estimate), so it is
+not part of their covariances.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ SMEAR_CYCLES = 2.3548 / (2 * np.pi * BAND_WIDTH)  # standard deviation in time o
 GAMMA_SHAPES = (1.0, 1.5, 2.0, 3.0, 4.0)  # of t^(k-1) exp(-t/theta): abrupt onset to slow build-up
 GAMMA_SCALES = tuple(np.geomspace(0.1, 2.5, 18))  # theta, cycles
 WIDTHS = tuple(np.geomspace(0.4, 2.5, 30))  # standard deviation of a symmetric pulse, cycles
+# Whether a recording's zero is the firing or the peak of what was fired, nothing in it tells. Two thirds of the delay leave less
+# than a quarter of a millimetre wrong either way
+COUNTED = 2 / 3
 CLEAR = 0.45  # residual of the causal shape over that of the symmetric one: below, the pulse is causal
 UNDECIDED = 0.8  # above, symmetric; between them the delay fades
 GOOD_FIT = 0.06  # largest RMS residual of a shape that explains the pulse
@@ -65,7 +69,7 @@ def delay_from_shape(pulse: Pulse, transducer_hz: float) -> float:
         return 0.0
     share = float(np.clip((UNDECIDED - ratio) / (UNDECIDED - CLEAR), 0, 1))
     near = rms[0] < 1.3 * rms[0][best] + 0.003  # shapes that explain it about as well: their mean delay
-    return share * max(float(delays[near].mean()), 0.0) / transducer_hz
+    return COUNTED * share * max(float(delays[near].mean()), 0.0) / transducer_hz
 
 
 def delay_from_bang(bang: npt.NDArray[np.complex128], pulse: Pulse, transducer_hz: float) -> float:

@@ -15,8 +15,9 @@ from CranioNavLib.sequence_metafile import Acquisition, Recording
 from ModuleUltrasoundLib.echo.candidates import Candidates, concatenate, find_candidates, reorder, rough_noise
 from ModuleUltrasoundLib.echo.features import line_features
 from ModuleUltrasoundLib.echo.forerun import Forerun, find_forerun, nominal_skin_s, steady, suppress_multiples
-from ModuleUltrasoundLib.echo.lean import at_samples, clip, pick, without_nan
+from ModuleUltrasoundLib.echo.lean import at_samples, clip, median, pick, without_nan
 from ModuleUltrasoundLib.echo.signal_chain import Band, Envelopes, check_acquisition, design_band, envelopes_of
+from ModuleUltrasoundLib.echo.static_echoes import believed, common_pattern, likeness
 from ModuleUltrasoundLib.echo.timing import BEFORE, BEHIND, Complexes
 
 BANG_SAMPLES = 40  # ten cycles
@@ -83,17 +84,20 @@ class Search:
     speed_m_s: float
     window_s: tuple[float, float]  # (least, most) behind the skin
     band: Band
-    several_spots: bool
     rank: Optional[Rank]
 
 
 def search_lines(
-    recording: Recording, speed_m_s: float, depth_mm: tuple[float, float], several_spots: bool, rank: Rank | None = None
+    recording: Recording,
+    speed_m_s: float,
+    depth_mm: tuple[float, float],
+    places: npt.NDArray[np.int64] | None,
+    rank: Rank | None = None,
 ) -> Found:
     """The candidates of every line with their features, in the order of `rank` (else of salience).
 
-    `depth_mm` (least, most) is where bone is looked for. `several_spots`: the lines come from several places on the head,
-    so that what repeats in all of them is an artefact, and can be subtracted.
+    `depth_mm` (least, most) is where bone is looked for. `places` (n,) numbers the places on the head that the lines come
+    from, so that what repeats in all of them is an artefact; None: all come from one.
 
     Raises
     ------
@@ -107,10 +111,11 @@ def search_lines(
     per_s = 500.0 * speed_m_s  # mm of depth a second of delay
     window = (depth_mm[0] / per_s, depth_mm[1] / per_s)
     band = design_band(acquisition, recording.lines.shape[1], nominal_skin_s(acquisition) * 1.04 + window[1] + BEHIND_S)
-    search = Search(acquisition, speed_m_s, window, band, several_spots, rank)
+    search = Search(acquisition, speed_m_s, window, band, rank)
     batches = max(-(-len(recording) // CHUNK), 1)
     parts = np.array_split(recording.lines, batches) if batches > 1 else [recording.lines]
-    found = [_search_batch(lines, search) for lines in parts]
+    of_parts = [None] * batches if places is None else np.array_split(places, batches)
+    found = [_search_batch(lines, of_part, search) for lines, of_part in zip(parts, of_parts)]
     candidates = concatenate([part.candidates for part in found])
     forerun = Forerun(**{name: _joined([part.forerun for part in found], name) for name in Forerun.__dataclass_fields__})
     phases, calm = _joined(found, "forerun_phases"), steady(forerun)
@@ -139,7 +144,7 @@ def _joined(parts: Sequence[object], name: str) -> Any:
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
-def _search_batch(lines: npt.NDArray[np.int16], search: Search) -> Found:
+def _search_batch(lines: npt.NDArray[np.int16], places: npt.NDArray[np.int64] | None, search: Search) -> Found:
     """The echoes of some lines; `bang` is the sum over them."""
     acquisition, rank = search.acquisition, search.rank
     envelopes, magnitude = envelopes_of(lines, search.band)
@@ -148,9 +153,15 @@ def _search_batch(lines: npt.NDArray[np.int16], search: Search) -> Found:
     bang[: len(start)] = start
     skin = nominal_skin_s(acquisition)
     forerun = find_forerun(envelopes, magnitude, rough_noise(magnitude), acquisition)
-    if search.several_spots and skin > 0:
-        suppress_multiples(envelopes, magnitude, forerun, acquisition)
+    pattern = None
+    if places is not None:
+        if skin > 0:
+            suppress_multiples(envelopes, magnitude, forerun, acquisition)
+        late = forerun.skin_s - median(forerun.skin_s)
+        pattern = common_pattern(envelopes, places, late, acquisition.transducer_hz)
     candidates = find_candidates(envelopes, magnitude, forerun.skin_s, search.window_s, acquisition.transducer_hz)
+    at = np.rint(without_nan(candidates.delays_s + forerun.skin_s[:, None], -1.0) * envelopes.rate_hz).astype(np.int64)
+    candidates = replace(candidates, static=believed(likeness(envelopes, pattern, at), candidates.amplitudes))
     features = line_features(candidates, forerun, skin, acquisition.transducer_hz, search.speed_m_s)
     scores = np.zeros(features.shape[:2]) if rank is None else rank(features)
     if rank is not None:

@@ -45,7 +45,7 @@ class EchoSettings(Parameters):
     least_depth_mm: Annotated[float, Limits(0, 20), "no bone is looked for above this depth"] = 1.4
     most_depth_mm: Annotated[float, Limits(2, 60), "no bone is looked for below this depth"] = 20.0
     # chosen on simulators that nothing was fitted to: a higher one costs points and hardly makes those that are left righter
-    quality_gate: Annotated[float, Limits(0, 1), "frames below this quality are not points"] = 0.86
+    quality_gate: Annotated[float, Limits(0, 1), "frames below this quality are not points"] = 0.93
     beam_width_mm: Annotated[float, Limits(0, 10), "-6 dB width of the beam"] = 1.2
     tilt_sd_deg: Annotated[float, Limits(0, 20), "SD of the angle between beam and bone normal"] = 2.0
 
@@ -97,6 +97,16 @@ def several_spots(recording: Recording, runs: npt.NDArray[np.int64]) -> bool:
     return bool(np.linalg.norm(known - middle, axis=1).max() > SAME_SPOT_MM)
 
 
+def places_of(recording: Recording, runs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64] | None:
+    """A number (F,) for each place on the head, along a glide for each few millimetres of it; None if all lines are of one."""
+    if not several_spots(recording, runs):
+        return None
+    if runs.max() >= 2:
+        return runs
+    steps = np.linalg.norm(np.diff(recording.probe_to_reference[:, :3, 3], axis=0, prepend=np.nan), axis=1)
+    return np.asarray(np.cumsum(np.nan_to_num(steps)) // SAME_SPOT_MM, dtype=np.int64)
+
+
 def measure_lines(
     recording: Recording, settings: EchoSettings | None = None, likelihood: Likelihood | None = None
 ) -> LineMeasurements:
@@ -114,7 +124,7 @@ def measure_lines(
         recording,
         settings.speed_of_sound_m_s,
         (settings.least_depth_mm, settings.most_depth_mm),
-        several_spots=several_spots(recording, runs),
+        places=places_of(recording, runs),
         rank=likelihood.networks[0].scores,
     )
     chance, shared = judge_echoes(found, likelihood, runs)

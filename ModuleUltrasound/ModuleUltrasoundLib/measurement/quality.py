@@ -15,7 +15,7 @@ Bools = npt.NDArray[np.bool_]
 
 TOLERANCE_MM = 0.5  # what "right" means
 GROUP_SHARE = 0.9  # groups nearly as likely as the likeliest one compete by their best echo
-CLIPPED_SHARE = 0.15  # of an echo's samples at the converter's end: beyond, its shape is lost
+CLIPPED_SHARE = 0.4  # of an echo's samples at the converter's end: beyond, its shape is lost
 QUIET_DB = 14.0  # the strongest of a line's candidates is below this over the noise: nothing is seen in it
 STRONG_FORERUN_DB = 5.0  # over the recording's median: nothing takes sound out of the forerun
 # The forerun's face sends all back in air, and 0.05 to 0.3 of it with skin and gel behind: 10 to 26 dB less
@@ -23,6 +23,7 @@ IN_AIR_DB = 12.0  # of the face's echo over that of the lines that see bone
 LIFTED_DB = 4.0  # the same, where the echo lies where the face's echo would repeat
 LEAST_IN_CONTACT = 3  # lines
 TILTED_DB = 9.0  # a bone echo weaker than this under the recording's others: a tilt of several degrees
+FAINT_DB = 13.0  # weaker than this it is no point, however sure: a layer that does not fade may have been followed instead
 LIKELY = 0.3
 UNSTABLE_MM = 1.0  # off the neighbours' median along the beam, while the probe rests
 STILL_MM = 2.0  # the probe rests: its origin moved less than this over the neighbours
@@ -107,11 +108,12 @@ def lost_contact(face: Array, multiple: Array, good: Bools) -> Bools:
     """Frames (n,) whose forerun ends in air: its face's echo (`face`, level) is far above that of the frames that see bone.
 
     No sound gets into the head then, and an echo is the face's own, once more: `multiple` (n,) says how well the chosen echo
-    lies where that would be. The rule needs no forerun echo in contact, where a well matched forerun shows none.
+    lies where that would be. The rule needs no forerun echo in contact, where a well matched forerun shows none. A recording
+    in which bone would be seen nowhere else than where the face's echo repeats has not been in contact.
     """
     known = good & (multiple < REPEATED) & (face > 0)
-    if known.sum() < LEAST_IN_CONTACT:
-        return np.zeros(len(face), dtype=bool)
+    if known.sum() < LEAST_IN_CONTACT:  # nothing shows that sound gets into the head at all
+        return good & (multiple > REPEATED)
     over_db = 20 * np.log10(np.maximum(face, 1e-9) / median(face[known]))
     return np.asarray((over_db > IN_AIR_DB) | ((over_db > LIFTED_DB) & (multiple > REPEATED)))
 
@@ -143,6 +145,7 @@ def reasons_of(
         ("no contact", lifted),
         ("saturated", clipped),
         ("unstable", shaky),
+        ("tilt too large", good & (strength_db < -FAINT_DB)),
         ("", good),
         ("no contact", forerun_db > STRONG_FORERUN_DB),
         ("tilt too large", (likely > LIKELY) & (strength_db < -TILTED_DB)),

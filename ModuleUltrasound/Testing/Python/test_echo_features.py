@@ -18,7 +18,7 @@ def candidates_at(depths_mm, snrs_db, **others):
     given = {
         "delays_s": np.array(depths_mm) / (500 * SPEED), "amplitudes": 10 ** (np.array(snrs_db) / 20), "phases": 0.0,
         "widths_s": 1e-7, "frequencies_hz": 4.6e6, "saliences_db": 20.0, "before_db": 0.0, "after_db": 0.0,
-        "before_all_db": 0.0, "after_all_db": 0.0, "rise_db": 20.0, "fall_db": 20.0, "end_db": 0.0, **others,
+        "before_all_db": 0.0, "after_all_db": 0.0, "rise_db": 20.0, "fall_db": 20.0, "end_db": 0.0, "static": 0.0, **others,
     }  # fmt: skip
     return Candidates(**{name: row(value) for name, value in given.items()}, noise=np.ones(1))
 

@@ -30,21 +30,21 @@ def a_recording():
 
 
 def test_batches_do_not_change_what_is_found(a_recording, monkeypatch):
-    whole = search_lines(a_recording, 1540.0, (1.4, 20.0), several_spots=False)
+    whole = search_lines(a_recording, 1540.0, (1.4, 20.0), places=None)
     monkeypatch.setattr(echo_search, "CHUNK", 7)
-    parts = search_lines(a_recording, 1540.0, (1.4, 20.0), several_spots=False)
+    parts = search_lines(a_recording, 1540.0, (1.4, 20.0), places=None)
     assert parts.depths_mm[:, 0] == pytest.approx(whole.depths_mm[:, 0], abs=5e-3)
 
 
 def test_candidates_stand_in_the_order_of_their_rank(a_recording):
-    found = search_lines(a_recording, 1540.0, (1.4, 20.0), False, rank=lambda features: features[..., 0])
+    found = search_lines(a_recording, 1540.0, (1.4, 20.0), None, rank=lambda features: features[..., 0])
     snr = found.candidates.snrs_db
     assert (np.diff(np.nan_to_num(snr, nan=-99), axis=1) <= 1e-6).all()
     assert found.features[..., 0][:, 0] * 20 == pytest.approx(np.minimum(snr[:, 0], CLEAR_DB), abs=1e-3)
 
 
 def test_windows_are_cut_around_the_first_candidates(a_recording):
-    found = search_lines(a_recording, 1540.0, (1.4, 20.0), False, rank=lambda features: features[..., 0])
+    found = search_lines(a_recording, 1540.0, (1.4, 20.0), None, rank=lambda features: features[..., 0])
     assert found.windows.shape[:2] == (60, KEPT)
     middle = np.abs(found.windows[:, 0, BEFORE])
     assert middle == pytest.approx(found.candidates.amplitudes[:, 0], rel=0.05)
@@ -61,7 +61,7 @@ def test_lines_that_end_before_any_bone_are_refused(a_recording, samples):
     short = with_lines(a_recording, a_recording.lines[:, :samples])
     with pytest.raises(InputError, match=r"the lines end after .* us, before bone can be seen"):
         check_length(short, 1540.0, 1.4)
-    assert np.isnan(search_lines(short, 1540.0, (1.4, 20.0), False).depths_mm).all()
+    assert np.isnan(search_lines(short, 1540.0, (1.4, 20.0), None).depths_mm).all()
 
 
 def test_lines_that_reach_bone_pass(a_recording):
@@ -72,11 +72,11 @@ def test_hum_that_the_line_cuts_off_leaves_no_echo_at_its_end(a_recording):
     time = np.arange(2900) / ACQUISITION.sampling_hz
     hum = np.round(4000 * np.sin(2 * np.pi * 1e4 * time + np.arange(60)[:, None]))
     lines = a_recording.lines + hum.astype(np.int16)
-    calm = search_lines(a_recording, 1540.0, (1.4, 20.0), False, rank=lambda features: features[..., 0])
-    hummed = search_lines(with_lines(a_recording, lines), 1540.0, (1.4, 20.0), False, rank=lambda features: features[..., 0])
+    calm = search_lines(a_recording, 1540.0, (1.4, 20.0), None, rank=lambda features: features[..., 0])
+    hummed = search_lines(with_lines(a_recording, lines), 1540.0, (1.4, 20.0), None, rank=lambda features: features[..., 0])
     assert hummed.depths_mm[:, 0] == pytest.approx(calm.depths_mm[:, 0], abs=0.02)
 
 
 def test_depth_is_half_the_way_of_the_sound(a_recording):
-    slow = search_lines(a_recording, 1500.0, (1.4, 20.0), False)
+    slow = search_lines(a_recording, 1500.0, (1.4, 20.0), None)
     assert slow.depths_mm == pytest.approx(slow.candidates.delays_s * 750e3, nan_ok=True)

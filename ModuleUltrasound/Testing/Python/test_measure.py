@@ -296,5 +296,7 @@ def test_what_lies_far_along_a_glide_says_nothing_about_a_line(monkeypatch):
     seen = replace(bone, probe_to_reference=glide, palpation_points=one_spot - 1)
     lost = replace(seen, lines=np.where(np.arange(count)[:, None] < 2 * near, seen.lines, no_bone.lines))
     first, second = (measure_lines(one, EchoSettings(speed_of_sound_m_s=SPEED)) for one in (seen, lost))
-    np.testing.assert_allclose(first.qualities[:near], second.qualities[:near], atol=1e-9)
-    assert second.qualities[-near:].max() < 0.5 < first.qualities[-near:].min()
+    # the probe's own echoes are looked for over all lines: that alone may move a little
+    np.testing.assert_allclose(first.qualities[:near], second.qualities[:near], atol=0.05)
+    assert second.qualities[-near:].max() < EchoSettings().quality_gate
+    assert first.qualities[-near:].min() > 0.5

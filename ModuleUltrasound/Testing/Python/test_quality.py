@@ -80,7 +80,8 @@ def reasons(**values):
         ({"quality": 0.0, "clipped": True, "lifted": True}, "no contact"),
         ({"quality": 0.9, "shaky": True}, "unstable"),
         ({"forerun_db": 12.0}, "no contact"),
-        ({"strength_db": -15.0}, "tilt too large"),
+        ({"strength_db": -12.0}, "tilt too large"),
+        ({"quality": 0.99, "strength_db": -15.0}, "tilt too large"),
         ({"depth_mm": np.nan, "likely": 0.0}, "no echo"),
         ({"line_snr_db": 9.0}, "no echo"),
         ({}, "doubtful echo"),
@@ -95,7 +96,14 @@ def test_face_far_above_that_of_the_lines_with_bone_is_in_air():
     again = np.array([0.0, 0.0, 0.0, 0.0, 0.9, 0.1])
     assert lost_contact(face, again, good).tolist() == [False, False, False, True, True, False]
     assert not lost_contact(face, again, np.zeros(6, dtype=bool)).any(), "nobody knows how strong it is in contact"
-    assert not lost_contact(np.zeros(6), again, good).any(), "there is no forerun"
+    assert not lost_contact(np.zeros(6), np.zeros(6), good).any(), "there is no forerun"
+
+
+def test_bone_that_is_seen_only_where_the_face_repeats_is_the_face():
+    again, good = np.array([1.0, 0.9, 1.0, 0.1, 1.0]), np.array([True, True, True, False, False])
+    assert lost_contact(np.full(5, 3.0), again, good).tolist() == [True, True, True, False, False]
+    elsewhere = np.concatenate([again, np.zeros(3)])
+    assert not lost_contact(np.full(8, 3.0), elsewhere, np.ones(8, dtype=bool)).any(), "three lines show contact"
 
 
 def test_echoes_side_by_side_count_together_when_the_bone_is_chosen():

@@ -61,6 +61,23 @@ def test_line_whose_face_is_lost_takes_the_others_time():
     assert forerun.skin_s[5] == pytest.approx(SKIN_S, abs=4e-9)
 
 
+def test_face_seen_in_air_only_is_the_zero_of_all_lines():
+    """A well matched delay line shows no face in contact: it does whenever the probe is lifted."""
+    height = np.zeros(20)
+    height[[0, 1, 9, 10, 19]] = 1.0
+    skin = SKIN_S * (1 + np.linspace(0.004, 0.008, 20))
+    forerun = steady(forerun_of(*lines_with([(skin, height), (skin + 8e-6, np.where(height > 0, 0, 0.5))], count=20)))
+    assert forerun.measured.all()
+    assert np.abs(forerun.skin_s - skin).max() < 2e-8
+
+
+def test_few_clear_echoes_at_different_times_are_not_the_face():
+    height = np.zeros(20)
+    height[[0, 1, 2, 10, 11, 12]] = 1.0
+    layer = np.where(np.arange(20) < 5, SKIN_S + 1e-7, SKIN_S + 4.5e-7)
+    assert not forerun_of(*lines_with([(layer, height)], count=20)).measured.any()
+
+
 def test_multiples_are_suppressed_and_bone_is_kept():
     rng = np.random.default_rng(2)
     bone = SKIN_S + rng.uniform(5e-6, 14e-6, 12)

@@ -31,6 +31,7 @@ NEPER = np.log(10) / 20  # a decibel
 FINE, CYCLES, BEFORE = 64, 32, 12  # points a cycle of a tabulated pulse, its length, and where its time zero is
 PATHS_MM = np.linspace(0, 30, 13)  # depths for which the pulse is tabulated
 SKULL_US_MM = 2 / 3.0  # there and back in bone
+FAINT_DB = -60.0
 LEAST_CODES = 0.5  # standard deviation of the noise: a converter that shows less shows no noise at all
 HARD_SHARE = 0.2  # of the lines with bone: of which nobody could say where the bone is
 CLEAR_DB, HEARD_DB = 3.0, 8.0  # over all before it, over the noise: what an expert asks of bone
@@ -114,8 +115,10 @@ class Sheet:
         inside = (index >= 0) & (index < count)
         self.rf += np.bincount((row[:, None] * count + index)[inside], wave[inside], self.rf.size).reshape(self.rf.shape)
 
-    def add_speckle(self, rng: np.random.Generator, way: Way, skin_us: Array, end_mm: Array, level: float) -> None:
-        """The tissue's own echoes from the skin to `end_mm` (n,) of each line."""
+    def add_speckle(
+        self, rng: np.random.Generator, way: Way, skin_us: Array, end_mm: Array, level: float, start_mm: Array | float = 0.0
+    ) -> None:
+        """What scatters from `start_mm` to `end_mm` (n,) behind the skin of each line."""
         session, per_us = self.pulse.session, self.pulse.session.speed_m_s * 5e-4
         skin_us = skin_us + self.late_us
         first = max(int(skin_us.min() * self.mhz), 0)
@@ -139,7 +142,8 @@ class Sheet:
             total += scipy.fft.irfft(spectrum, size, axis=1)[:, : last - first] * share
         index = np.arange(first, last)
         ends = (skin_us + np.maximum(end_mm, 0) / per_us) * self.mhz
-        total *= (index > (skin_us * self.mhz)[:, None]) & (index < ends[:, None])
+        starts = (skin_us + start_mm / per_us) * self.mhz
+        total *= (index > starts[:, None]) & (index < ends[:, None])
         self.rf[:, first:last] += total * (level / np.sqrt(2) * way.coupling).astype(np.float32)[:, None]
 
 
@@ -168,6 +172,9 @@ def simulate(rng: np.random.Generator, frames: int, session: Session | None = No
     tissue = (kind == "tissue") & (way.contact > 0)
     end = np.where(np.isfinite(bone) & (way.contact > 0), way.depth_mm, np.where(tissue, 99.0, 0.0))
     sheet.add_speckle(rng, way, skin_us, end, speckle)
+    if session.diploe_db > FAINT_DB:
+        inner = np.where(np.isfinite(bone), way.depth_mm + SKULL_US_MM * session.skull_mm * session.speed_m_s / 2e3, 0.0)
+        sheet.add_speckle(rng, way, skin_us, inner, 10 ** (session.diploe_db / 20), way.depth_mm)
     for number in range(4):
         height = np.where(kind == "nothing", 0.0, way.layers[:, number] * way.coupling)
         sheet.add(skin_us + way.layers_mm[:, number] * 2e3 / session.speed_m_s, height, np.nan_to_num(way.layers_mm[:, number]))

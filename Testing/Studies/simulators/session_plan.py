@@ -48,6 +48,7 @@ class Session:
     layer_floor_db: float  # their diffuse echo under their specular one
     inner_db: float  # inner table under bone's echo
     skull_mm: float
+    diploe_db: float  # what scatters between the tables
     again_db: float  # bone, face, bone: under bone's echo
     face_r: float  # reflection of the delay line's face in contact
     back: float  # what comes back from the transducer's end for the next multiple
@@ -115,6 +116,7 @@ def draw_session(rng: np.random.Generator) -> Session:
         layer_floor_db=float(rng.uniform(-18, -9)),
         inner_db=_maybe(rng, 0.5, -28, -8, -99.0),
         skull_mm=float(rng.uniform(3, 8)),
+        diploe_db=_maybe(rng, 0.3, -36, -16, -99),
         again_db=_maybe(rng, 0.5, -32, -8, -99.0),
         face_r=float(np.sign(reflection) * np.clip(abs(reflection) * 10 ** (rng.uniform(-3, 3) / 20), 0.05, 0.316)),
         back=float(rng.choice([-1, 1]) * rng.uniform(0.1, 0.6)),
