@@ -2,8 +2,9 @@
 
     python -m Testing.Benchmarks.echo --worlds 300 --seed 7
 
-The recordings are drawn like those of the calibration, from each of its families (Testing/Studies/simulators) and from
-plain_lines.py, which no network is fitted to, with other seeds. Depths are judged with the true speed of sound given.
+The recordings are drawn like those of the calibration, from each of its families (Testing/Studies/simulators), with other
+seeds, and from families that no network is fitted to (plain_lines, grid_lines, kirchhoff_lines; other recordings of them
+calibrate the stated quality). Depths are judged with the true speed of sound given.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from Testing.Studies.simulators import (
     bedside_lines,
     bench_lines,
     facet_lines,
+    grid_lines,
+    kirchhoff_lines,
     layer_lines,
     page_lines,
     plain_lines,
@@ -49,6 +52,8 @@ SIMULATORS: dict[str, Callable[..., Any]] = {
     "range_lines": range_lines.simulate,
     "layer_lines": layer_lines.simulate,
     "plain_lines": plain_lines.simulate,
+    "grid_lines": grid_lines.simulate,
+    "kirchhoff_lines": kirchhoff_lines.simulate,
 }
 FAMILIES = ("echo_lines", *SIMULATORS)
 
