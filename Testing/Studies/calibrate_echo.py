@@ -71,7 +71,7 @@ LABEL_MM = 0.4  # a candidate this near to the bone stands for it
 LATE_CYCLES = 1.2  # without a forerun echo the peak of a pulse that rises at its arrival comes later; corrected afterwards
 LINES_EACH = 24  # of a recording, for the fit: further ones say little new
 HELD_OUT = 10  # every tenth recording
-LEAST_LINES, LEAST_BONE = 12, 0.25  # lines, and share of them with bone, of a recording that calibrates the quality
+LEAST_LINES = 12  # of a recording that calibrates the quality: with fewer there is no recording around a line
 KNOTS = 14  # of the map of the quality
 FEW = 20  # lines of a family in a bin: fewer say little
 FILE = 400  # recordings a file of the cache
@@ -194,14 +194,13 @@ def calibrate_quality(held: list[Simulated], likelihood: Likelihood) -> tuple[Ar
     """Knots of the monotone map from the likelihood's quality to the share of depths within the tolerance.
 
     A new simulator, or a patient, is one more family: what is expected of it is the mean over the families of their shares,
-    however many lines each has in a bin. A recording in which hardly a line shows bone is left out: nothing tells a lone
-    interface from bone there, and nobody navigates by it. So are short ones.
+    however many lines each has in a bin. Short recordings are left out.
     """
     edges = np.concatenate([[0.0], np.linspace(0.05, 0.95, KNOTS - 3), [0.98, 0.995, 1.0 + 1e-9]])
     families = sorted({one.family for one in held})
     sums = np.zeros((len(families), 3, len(edges) - 1))  # lines, stated, right
     for one in held:
-        if len(one.true_mm) < LEAST_LINES or np.isfinite(one.true_mm).mean() < LEAST_BONE:
+        if len(one.true_mm) < LEAST_LINES:
             continue
         found = measure_lines(one.recording, EchoSettings(speed_of_sound_m_s=one.speed_m_s), likelihood)
         right = np.abs(np.nan_to_num(found.depths_mm - one.true_mm, nan=np.inf)) < TOLERANCE_MM
