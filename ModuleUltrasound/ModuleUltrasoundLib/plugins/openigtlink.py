@@ -24,8 +24,8 @@ CLOCKS_AGREE_S = 0.5  # a sender's time stamp that differs more from this comput
 class OpenIGTLinkDevice(AModeDevice):
     """Client of an OpenIGTLink server that sends A-lines.
 
-    The protocol does not say how a line was sampled: `sampling_hz` must be given. Gain, range and trigger are the
-    sender's own affair. A message whose checksum is wrong, or that is no line, is counted and never a line.
+    The protocol does not say how a line was sampled: `sampling_hz` must be given. Gain, delay, range, averaging and trigger are
+    the sender's own affair. A message whose checksum is wrong, or that is no line, is counted and never a line.
     """
 
     name = "openigtlink"
