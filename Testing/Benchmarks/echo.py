@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,40 +21,14 @@ import numpy.typing as npt
 from CranioNavLib.sequence_metafile import Acquisition, Recording
 from ModuleUltrasoundLib.measurement.measure import EchoSettings, measure_lines
 
-from Testing.Studies.simulators import (
-    bedside_lines,
-    bench_lines,
-    facet_lines,
-    grid_lines,
-    kirchhoff_lines,
-    layer_lines,
-    page_lines,
-    plain_lines,
-    range_lines,
-    session_lines,
-    theatre_lines,
-    tissue_lines,
-)
+from Testing.Studies.simulators import bench_lines
 from Testing.Studies.simulators.echo_lines import draw_world, simulate
+from Testing.Studies.simulators.families import HARD, SESSIONS, UNSEEN
 
 Array = npt.NDArray[np.float64]
 FRAMES = 40
 SYMMETRIC = ("gauss", "ricker", "hann", "chirp", "symmetric")
-SIMULATORS: dict[str, Callable[..., Any]] = {
-    "tissue_lines": tissue_lines.simulate,
-    "bench_lines": bench_lines.simulate,
-    "page_lines": page_lines.simulate,
-    "session_lines": session_lines.simulate,
-    "bedside_lines": bedside_lines.simulate,
-    "facet_lines": facet_lines.simulate,
-    "theatre_lines": theatre_lines.simulate,
-    "range_lines": range_lines.simulate,
-    "layer_lines": layer_lines.simulate,
-    "plain_lines": plain_lines.simulate,
-    "grid_lines": grid_lines.simulate,
-    "kirchhoff_lines": kirchhoff_lines.simulate,
-}
-FAMILIES = ("echo_lines", *SIMULATORS)
+SIMULATORS = HARD | SESSIONS | UNSEEN
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +56,7 @@ def measure_world(seed: int, family: str = "echo_lines") -> Judged:
         recording, truth, world = simulate(rng, FRAMES)
         each_line = world.snr_per_line
     else:
-        recording, truth, world = SIMULATORS[family](rng, FRAMES)
+        recording, truth, world = SIMULATORS[family].simulate(rng, FRAMES)
         each_line = getattr(world, "snr_of", "line") == "line"
     lines = measure_lines(recording, EchoSettings(speed_of_sound_m_s=truth.speed_m_s))
     return Judged(
@@ -202,7 +175,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--jobs", type=int, default=2)
     options = parser.parse_args()
-    for family in FAMILIES:
+    for family in SIMULATORS:
         seeds = [options.seed * 1_000_003 + i for i in range(options.worlds)]
         with ProcessPoolExecutor(options.jobs) as pool:
             judged = list(pool.map(partial(measure_world, family=family), seeds, chunksize=4))

@@ -19,7 +19,6 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -31,37 +30,10 @@ from ModuleUltrasoundLib.measurement.measure import EchoSettings, measure_lines,
 from ModuleUltrasoundLib.measurement.quality import TOLERANCE_MM
 
 from Testing.Studies.fit_network import Lines, fit, joined
-from Testing.Studies.simulators import (
-    bedside_lines,
-    bench_lines,
-    echo_lines,
-    facet_lines,
-    grid_lines,
-    kirchhoff_lines,
-    layer_lines,
-    page_lines,
-    plain_lines,
-    range_lines,
-    session_lines,
-    theatre_lines,
-    tissue_lines,
-)
+from Testing.Studies.simulators import bench_lines, echo_lines, tissue_lines
+from Testing.Studies.simulators.families import HARD, SESSIONS, UNSEEN
 
 Array = npt.NDArray[np.float64]
-HARD: dict[str, Any] = {"bench_lines": bench_lines, "page_lines": page_lines}
-UNSEEN: dict[str, Any] = {
-    "plain_lines": plain_lines,
-    "grid_lines": grid_lines,
-    "kirchhoff_lines": kirchhoff_lines,
-}  # never fitted to
-SESSIONS: dict[str, Any] = {  # as they go on a head: their lines follow each other
-    "session_lines": session_lines,
-    "bedside_lines": bedside_lines,
-    "facet_lines": facet_lines,
-    "theatre_lines": theatre_lines,
-    "range_lines": range_lines,
-    "layer_lines": layer_lines,
-}
 # Recordings of each family, of the number asked for: in a water bath there is less to learn, and exact physics takes its time
 FAMILIES = {"echo_lines": 1.0, "tissue_lines": 1.0, "bench_lines": 1.0, "bare_lines": 0.25, "page_lines": 1.0} | {
     name: 1.0 if name == "session_lines" else 0.25 for name in SESSIONS

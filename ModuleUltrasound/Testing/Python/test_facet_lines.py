@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import hilbert
+from simulated_peaks import peaks_off_mm
 
 from Testing.Studies.simulators import facet_lines
 from Testing.Studies.simulators.facet_plan import draw_world
@@ -43,17 +44,9 @@ def test_recording_has_as_many_lines_as_asked_for(frames):
 
 def off_mm(recording, truth, world):
     """Peak of the envelope near the bone minus the truth, of clear lines met squarely."""
-    sampling = recording.acquisition.sampling_hz
-    time = np.arange(recording.lines.shape[1]) / sampling
-    near_s = 0.7 / world.shape.centre_hz
-    off = []
-    for row in np.flatnonzero((truth.snr_db > 25) & (truth.tilt_deg < 3)):
-        skin = world.forerun.time_s + world.forerun.warming_s * row / len(recording)
-        arrival = skin + 2e-3 * truth.depth_mm[row] / truth.speed_m_s
-        near = np.abs(time - arrival) < max(near_s, 3 / sampling)
-        level = np.abs(hilbert(recording.lines[row] - np.median(recording.lines[row])))[near]
-        off.append((time[near][level.argmax()] - arrival) * truth.speed_m_s * 500)
-    return off
+    skin_s = world.forerun.time_s + world.forerun.warming_s * np.arange(len(recording)) / len(recording)
+    clear = np.flatnonzero((truth.snr_db > 25) & (truth.tilt_deg < 3))
+    return peaks_off_mm(recording, truth, clear, skin_s, 0.7 / world.shape.centre_hz)
 
 
 def test_echo_stands_where_the_truth_says(some_recordings):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import hilbert
+from simulated_peaks import peaks_off_mm
 
 from Testing.Studies.simulators import kirchhoff_lines
 from Testing.Studies.simulators.kirchhoff_plan import draw_world
@@ -45,17 +45,9 @@ def test_recording_has_about_as_many_lines_as_asked_for(frames):
 
 def off_mm(recording, truth, world):
     """Peak of the envelope near the bone minus the truth, of clear lines that have to be accepted."""
-    sampling = recording.acquisition.sampling_hz
-    time = np.arange(recording.lines.shape[1]) / sampling
-    off = []
-    for row in np.flatnonzero(world.must & (truth.snr_db > 25)):
-        line = world.forerun
-        skin = line.time_s / (1 + line.faster + line.drift * row / len(recording))
-        arrival = skin + 2e-3 * truth.depth_mm[row] / truth.speed_m_s
-        near = np.abs(time - arrival) < 0.5e-6
-        level = np.abs(hilbert(recording.lines[row] - np.median(recording.lines[row])))[near]
-        off.append((time[near][level.argmax()] - arrival) * truth.speed_m_s * 500)
-    return off
+    line = world.forerun
+    skin_s = line.time_s / (1 + line.faster + line.drift * np.arange(len(recording)) / len(recording))
+    return peaks_off_mm(recording, truth, np.flatnonzero(world.must & (truth.snr_db > 25)), skin_s, 0.5e-6)
 
 
 def test_echo_stands_where_the_truth_says(some_recordings):

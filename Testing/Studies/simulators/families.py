@@ -1,0 +1,30 @@
+"""The families of simulated A-lines: no two share a model of tissue, pulse or hand."""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+from Testing.Studies.simulators import (
+    bedside_lines,
+    bench_lines,
+    echo_lines,
+    facet_lines,
+    grid_lines,
+    kirchhoff_lines,
+    layer_lines,
+    page_lines,
+    plain_lines,
+    range_lines,
+    session_lines,
+    theatre_lines,
+    tissue_lines,
+)
+
+
+def _by_name(*modules: ModuleType) -> dict[str, ModuleType]:
+    return {module.__name__.rsplit(".", 1)[1]: module for module in modules}
+
+
+HARD = _by_name(echo_lines, tissue_lines, bench_lines, page_lines)  # drawn to be hard, their lines hardly follow each other
+SESSIONS = _by_name(session_lines, bedside_lines, facet_lines, theatre_lines, range_lines, layer_lines)  # as they go on a head
+UNSEEN = _by_name(plain_lines, grid_lines, kirchhoff_lines)  # no network is fitted to them
