@@ -14,8 +14,7 @@ from Testing.Studies.simulators import session_lines
 def test_family_that_no_network_was_fitted_to_is_told_as_well_as_the_others():
     judged = [measure_world(90_000_000 + index, "plain_lines") for index in range(100)]
     found = rates(judged)
-    # 99 % is asked for; one of these recordings is taken at its interface throughout, of all others 2 lines are wrong
-    assert found["within 0.5 mm"] >= 0.97  # families that are drawn to be hard among them5
+    assert found["within 0.5 mm"] >= 0.99
     assert found["within 0.25 mm"] >= 0.95
     assert found["accepted < 3 deg"] >= 0.9
     assert found["accepted without bone"] < 0.01
@@ -39,7 +38,7 @@ def test_detector_stays_as_good_as_it_was_over_many_simulated_worlds(family):
 @pytest.mark.parametrize("family", ["echo_lines", "tissue_lines", "page_lines", "plain_lines"])
 def test_accepted_depths_are_right_in_a_few_simulated_worlds(family):
     found = rates([measure_world(91_000_000 + index, family) for index in range(6)])
-    assert found["within 0.5 mm"] >= 0.97  # families that are drawn to be hard among them
+    assert found["within 0.5 mm"] >= 0.98
     assert found["within 0.25 mm"] >= 0.95
     assert found["accepted without bone"] <= 0.02
 
