@@ -24,8 +24,8 @@ SMEAR_CYCLES = 2.3548 / (2 * np.pi * BAND_WIDTH)  # standard deviation in time o
 GAMMA_SHAPES = (1.0, 1.5, 2.0, 3.0, 4.0)  # of t^(k-1) exp(-t/theta): abrupt onset to slow build-up
 GAMMA_SCALES = tuple(np.geomspace(0.1, 2.5, 18))  # theta, cycles
 WIDTHS = tuple(np.geomspace(0.4, 2.5, 30))  # standard deviation of a symmetric pulse, cycles
-# Whether a recording's zero is the firing or the peak of what was fired, nothing in it tells. Two thirds of the delay leave less
-# than a quarter of a millimetre wrong either way
+# Nothing in a recording tells whether its zero is the firing or the peak of what was fired. Two thirds of the delay: of at most
+# 0.4 mm a third is left wrong if it is the firing, two thirds if it is the peak
 COUNTED = 2 / 3
 CLEAR = 0.45  # residual of the causal shape over that of the symmetric one: below, the pulse is causal
 UNDECIDED = 0.8  # above, symmetric; between them the delay fades

@@ -160,8 +160,9 @@ def _search_batch(lines: npt.NDArray[np.int16], places: npt.NDArray[np.int64] | 
         late = forerun.skin_s - median(forerun.skin_s)
         pattern = common_pattern(envelopes, places, late, acquisition.transducer_hz)
     candidates = find_candidates(envelopes, magnitude, forerun.skin_s, search.window_s, acquisition.transducer_hz)
-    at = np.rint(without_nan(candidates.delays_s + forerun.skin_s[:, None], -1.0) * envelopes.rate_hz).astype(np.int64)
-    candidates = replace(candidates, static=believed(likeness(envelopes, pattern, at), candidates.amplitudes))
+    if pattern is not None:
+        at = np.rint(without_nan(candidates.delays_s + forerun.skin_s[:, None], -1.0) * envelopes.rate_hz).astype(np.int64)
+        candidates = replace(candidates, static=believed(likeness(envelopes, pattern, at), candidates.amplitudes))
     features = line_features(candidates, forerun, skin, acquisition.transducer_hz, search.speed_m_s)
     scores = np.zeros(features.shape[:2]) if rank is None else rank(features)
     if rank is not None:

@@ -84,10 +84,8 @@ def believed(likeness: Array, amplitudes: Array) -> Array:
     return np.where(likeness > HALF, share * likeness, 0.0)
 
 
-def likeness(envelopes: Envelopes, pattern: Pattern | None, samples: npt.NDArray[np.int64]) -> Array:
+def likeness(envelopes: Envelopes, pattern: Pattern, samples: npt.NDArray[np.int64]) -> Array:
     """How far each echo at `samples` (n, K), negative where there is none, is the pattern: 0 not at all, 1 wholly."""
-    if pattern is None:
-        return np.zeros(samples.shape)
     number = clip(samples.T, 0, envelopes.values.shape[1] - 1)
     here = at_samples(envelopes.values, number)
     at = clip(number - pattern.late, 0, len(pattern.values) - 1)

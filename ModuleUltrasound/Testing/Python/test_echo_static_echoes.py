@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from CranioNavLib.sequence_metafile import Acquisition
 from ModuleUltrasoundLib.echo.signal_chain import complex_envelopes, design_band
-from ModuleUltrasoundLib.echo.static_echoes import common_pattern, likeness
+from ModuleUltrasoundLib.echo.static_echoes import believed, common_pattern, likeness
 
 RATE, CENTRE = 60e6, 5e6
 PLACES = np.repeat(np.arange(6), 5)
@@ -49,10 +49,24 @@ def test_noise_is_like_no_pattern():
 
 @pytest.mark.parametrize("places", [np.zeros(30, dtype=np.int64), np.repeat([0, 1], 15)])
 def test_a_place_or_two_tell_nothing(places):
-    assert not likeness_at(envelopes_with([(STATIC_S, 0.3)]), STATIC_S, places).any()
+    assert common_pattern(envelopes_with([(STATIC_S, 0.3)]), places, NONE, CENTRE) is None
 
 
 def test_where_there_is_no_echo_there_is_no_likeness():
     envelopes = envelopes_with([(STATIC_S, 0.3)])
     pattern = common_pattern(envelopes, PLACES, NONE, CENTRE)
     assert not likeness(envelopes, pattern, np.full((30, 2), -1)).any()
+
+
+def test_constant_echo_that_nothing_exceeds_is_a_scalp_as_thick_everywhere():
+    likenesses = np.array([[0.9, 0.0], [0.9, 0.0], [0.9, 0.0], [0.0, 0.0]])
+    weaker, stronger = np.full(4, 1.0), np.full(4, 3.0)
+    assert not believed(likenesses, np.stack([stronger, weaker], axis=1)).any()
+    np.testing.assert_allclose(believed(likenesses, np.stack([weaker, stronger], axis=1)), likenesses)
+    half = np.stack([np.full(4, 2.0), [1.0, 3.0, 3.0, 3.0]], axis=1)
+    np.testing.assert_allclose(believed(likenesses, half), likenesses * 2 / 3)
+
+
+def test_echo_that_is_less_than_half_the_pattern_is_none_of_it():
+    likenesses = np.array([[0.9, 0.4], [0.9, 0.4]])
+    assert not believed(likenesses, np.array([[1.0, 3.0], [1.0, 3.0]]))[:, 1].any()
