@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))  # for what several test files share
+from echo_logic import a_head, a_logic, a_recording_logic  # noqa: F401 (fixtures)
 
 
 @pytest.fixture

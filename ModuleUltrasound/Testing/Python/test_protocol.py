@@ -8,7 +8,8 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import invert_rigid, rigid_from_vector, transform_directions, transform_points
 from CranioNavLib.surface import Surface
 from ModuleUltrasoundLib.palpation.clamp import clear_of_clamp
-from ModuleUltrasoundLib.palpation.protocol import LANDMARK_LABELS, REGIONS, _first_dip, plan_protocol, probe_footprint
+from ModuleUltrasoundLib.palpation.head_frame import LANDMARK_LABELS
+from ModuleUltrasoundLib.palpation.protocol import REGIONS, plan_protocol, probe_footprint
 
 COUNTS = {"Left lateral": 3, "Right lateral": 3, "Frontal convexity": 4, "Forehead": 4, "Periorbital": 4}
 # Nasion at the origin of the head built below
@@ -102,16 +103,6 @@ def test_without_landmarks_the_shape_gives_a_plan_near_the_same(a_skull):
     assert (plan.positions_ras_mm[[r == "Right lateral" for r in plan.regions], 0] > 40).all()
 
 
-def test_the_nasion_is_the_uppermost_dip_of_the_profile_and_no_hole():
-    z = np.arange(100.0)  # mm downwards
-    face = 80 - 0.004 * (z - 40) ** 2 - 5.0 * np.exp(-(((z - 60) / 5) ** 2)) - 6.0 * np.exp(-(((z - 85) / 5) ** 2))
-    assert _first_dip(face) == pytest.approx(60, abs=2)
-    assert _first_dip(face + 0.2 * z) == pytest.approx(60, abs=2)  # nodding by 11 degrees
-    holed = np.where((z > 25) & (z < 40), face - 30.0, face)
-    assert _first_dip(holed) == pytest.approx(60, abs=2)
-    assert _first_dip(80 - 0.004 * (z - 40) ** 2) is None
-
-
 def test_unknown_landmark_names_fall_back_on_the_shape(a_skull):
     assert np.allclose(plan_protocol(a_skull, LANDMARKS, list("abcd")).head_to_ras, plan_protocol(a_skull).head_to_ras)
 
@@ -188,7 +179,7 @@ def test_a_probe_cannot_stand_at_an_edge_or_on_a_step():
 def test_the_nasion_is_the_uppermost_dip_that_neighbours_share_though_more_are_under_the_orbits(a_skull, monkeypatch):
     seen = [95, None, 90, 92, 53, 52, 48, 47, None, 87, 85, 93, None]  # as on a real skull: 4 mm steps from its right to its left
     dips = iter([20, None, None, *seen, None, None, None])  # and a lone one higher up, of a hole's rim
-    monkeypatch.setattr("ModuleUltrasoundLib.palpation.protocol._first_dip", lambda profile: next(dips))
+    monkeypatch.setattr("ModuleUltrasoundLib.palpation.head_frame._first_dip", lambda profile: next(dips))
     origin = plan_protocol(a_skull).head_to_ras[:3, 3]
     top = a_skull.vertices_mm[:, 2].max() - 45.0
     assert 46.0 < top - origin[2] < 54.0
@@ -197,5 +188,5 @@ def test_the_nasion_is_the_uppermost_dip_that_neighbours_share_though_more_are_u
 
 def test_two_dips_that_disagree_still_give_a_nasion(a_skull, monkeypatch):
     dips = iter([30, None, 80] + [None] * 50)
-    monkeypatch.setattr("ModuleUltrasoundLib.palpation.protocol._first_dip", lambda profile: next(dips))
+    monkeypatch.setattr("ModuleUltrasoundLib.palpation.head_frame._first_dip", lambda profile: next(dips))
     assert np.isfinite(plan_protocol(a_skull).head_to_ras).all()
