@@ -78,8 +78,8 @@ def _maybe(rng: np.random.Generator, share: float, low: float, high: float, othe
     return float(rng.uniform(low, high)) if rng.random() < share else otherwise
 
 
-def draw_session(rng: np.random.Generator) -> Session:
-    """A set-up; levels that are absent are -99 dB."""
+def _draw_device(rng: np.random.Generator) -> tuple[Acquisition, float, float]:
+    """What the recording's header says, the tissue's speed of sound, and the reflection of the delay line's face."""
     nominal = float(rng.uniform(3, 10))
     rates = np.array([25, 30, 40, 50, 60, 62.5, 64, 80, 100, 125])
     sampling = float(rng.choice(rates[rates >= 2.6 * nominal]))
@@ -87,6 +87,14 @@ def draw_session(rng: np.random.Generator) -> Session:
     material, reflection = MATERIALS[rng.integers(len(MATERIALS))]
     forerun = rng.random() < 0.5
     length = float(rng.uniform(8, 30))
+    line = (length, material) if forerun else (0.0, 0.0)
+    return Acquisition(sampling * 1e6, nominal * 1e6, *line), speed, reflection
+
+
+def draw_session(rng: np.random.Generator) -> Session:
+    """A set-up; levels that are absent are -99 dB."""
+    acquisition, speed, reflection = _draw_device(rng)
+    forerun = acquisition.forerun_length_mm > 0
     typical = float(rng.uniform(*DEPTH_MM))
     without = str(rng.choice(["", "tissue", "air", "nothing"], p=[0.87, 0.07, 0.03, 0.03]))
     damped = rng.random() < 1 / 3
@@ -96,8 +104,8 @@ def draw_session(rng: np.random.Generator) -> Session:
     ]
     trail = [(float(rng.uniform(0.8, 3)) * (one + 1), -float(rng.uniform(20, 35))) for one in range(rng.integers(0, 3))]
     return Session(
-        acquisition=Acquisition(sampling * 1e6, nominal * 1e6, length if forerun else 0.0, material if forerun else 0.0),
-        centre_mhz=nominal * float(rng.uniform(0.94, 1.06)),
+        acquisition=acquisition,
+        centre_mhz=acquisition.transducer_hz * 1e-6 * float(rng.uniform(0.94, 1.06)),
         pulse="damped" if damped else "gauss",
         bandwidth=float(rng.uniform(0.4, 0.9)),
         order=float(rng.uniform(1, 3)),
