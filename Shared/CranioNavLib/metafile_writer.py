@@ -10,23 +10,22 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Iterator, Mapping, Sized
+from collections.abc import Collection, Mapping, Sized
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Optional
+from typing import Optional
 
 import numpy as np
 import numpy.typing as npt
 
 from CranioNavLib.errors import InputError
-from CranioNavLib.files import set_aside, written_whole
+from CranioNavLib.files import written_whole
 from CranioNavLib.metafile_reader import is_transform
+from CranioNavLib.metafile_recovery import checked_target, dim_size, is_whole, recover, taken_back
 from CranioNavLib.recording import Acquisition, Recording, pixels_beside
 from CranioNavLib.rigid import Array
 
-PAD = 40  # PLUS pads DimSize to this width, so that it can be patched in place
 LONGEST_VALUE = 900  # IGSIO reads at most 999 characters a line
-FRAME_DONE = re.compile(rb"Seq_Frame(\d+)_Timestamp = .*\n")  # the last field of each frame
 
 
 def write_recording(path: str | Path, recording: Recording) -> None:
@@ -37,7 +36,7 @@ def write_recording(path: str | Path, recording: Recording) -> None:
     InputError
         The path does not end in .mha, cannot be written, or arrays of the recording disagree in length.
     """
-    target = _checked_target(path)
+    target = checked_target(path)
     count, samples = recording.lines.shape
     _check_lengths(recording)
     with written_whole(target) as temporary, temporary.open("wb") as file:
@@ -81,10 +80,10 @@ class RecordingWriter:
     ) -> None:
         if samples and acquisition is None:
             raise InputError("a recording of A-lines needs their acquisition (sampling and transducer frequency)")
-        self.path, self.samples, self.count = _checked_target(path), samples, 0
+        self.path, self.samples, self.count = checked_target(path), samples, 0
         self._last_time = -np.inf
         self._raw_path = pixels_beside(self.path)
-        if self._raw_path.exists() and self._raw_path.stat().st_size and not _is_whole(self.path):
+        if self._raw_path.exists() and self._raw_path.stat().st_size and not is_whole(self.path):
             raise InputError(f"{self.path} holds an interrupted recording; recover or remove it, or record to another name")
         self._header = _global_header(samples, 0, acquisition, fields or {})
         self._tail = f"ElementDataFile = {self._raw_path.name if samples else 'LOCAL'}\n".encode("ascii")
@@ -105,6 +104,7 @@ class RecordingWriter:
         statuses: Optional[Mapping[str, str]] = None,
         line: Optional[npt.NDArray[np.int16]] = None,
         palpation_point: int = -1,
+        invalid: bool = False,
     ) -> None:
         """Add one frame.
 
@@ -120,6 +120,8 @@ class RecordingWriter:
             The RF line; None only in a recording of poses.
         palpation_point : int
             Point of the protocol, -1 for none.
+        invalid : bool
+            As for `mark_invalid`.
         """
         if self._fields is None:
             raise InputError(f"{self.path}: the recording is closed; start a new one")
@@ -129,32 +131,54 @@ class RecordingWriter:
         if size != self.samples:
             raise InputError(f"{self.path}: frame {self.count} has {size} samples, expected {self.samples}")
         fields = _frame_fields(self.count, timestamp_s, transforms, statuses or {}, palpation_point)
+        fields = (taken_back(self.count) if invalid else b"") + fields
         try:
             if self.count == 0:
                 os.ftruncate(self._fields, 0)
                 _write_at(self._fields, self._header + self._tail, 0)
                 self._end = len(self._header)
-            # Order matters: pixels, then fields, then the count; of the fields first what comes behind the old last line,
-            # then what takes its place. A kill in between leaves files that are still right.
+            # Order matters: pixels, then fields, then the count. A kill in between leaves files that are still right.
             if line is not None and self._raw is not None:
                 _write_at(self._raw, np.ascontiguousarray(line, dtype="<i2").tobytes(), self.count * 2 * self.samples)
-            added, cut = fields + self._tail, len(self._tail)
-            _write_at(self._fields, added[cut:], self._end + cut)
-            _write_at(self._fields, added[:cut], self._end)
-            _write_at(self._fields, _dim_size(self.samples, self.count + 1), self._header.index(b"DimSize = "))
+            self._write_fields(self._fields, fields)
+            _write_at(self._fields, dim_size(self.samples, self.count + 1), self._header.index(b"DimSize = "))
         except OSError as error:
-            raise InputError(
-                f"cannot go on writing {self.path}: {error.strerror}; {self.count} frames are safe, free space and record anew"
-            ) from None
+            raise self._cannot_go_on(error) from None
         self._end += len(fields)
         self.count += 1
         self._last_time = timestamp_s
 
-    def close(self, invalid: Collection[int] = ()) -> None:
-        """Join fields and pixels into one file; may be called twice. A recording without frames leaves no file.
+    def mark_invalid(self, frames: Collection[int]) -> None:
+        """Frames written before get the ImageStatus INVALID, on the disk at once: their lines are kept, and never become points.
 
-        The frames `invalid` get the ImageStatus INVALID: their lines are kept, and never become points.
+        Raises
+        ------
+        InputError
+            The disk takes no more.
         """
+        if self._fields is None or not frames:
+            return
+        marks = b"".join(map(taken_back, sorted(frames)))
+        try:
+            self._write_fields(self._fields, marks)
+        except OSError as error:
+            raise self._cannot_go_on(error) from None
+        self._end += len(marks)
+
+    def _write_fields(self, handle: int, fields: bytes) -> None:
+        """Put fields before the last line: first what comes behind that line, then what takes its place, so that a kill in
+        between leaves the file as it was."""
+        added, cut = fields + self._tail, len(self._tail)
+        _write_at(handle, added[cut:], self._end + cut)
+        _write_at(handle, added[:cut], self._end)
+
+    def _cannot_go_on(self, error: OSError) -> InputError:
+        return InputError(
+            f"cannot go on writing {self.path}: {error.strerror}; {self.count} frames are safe, free space and record anew"
+        )
+
+    def close(self) -> None:
+        """Join fields and pixels into one file; may be called twice. A recording without frames leaves no file."""
         if self._fields is None:
             return
         empty = self.count == 0 and os.fstat(self._fields).st_size == 0
@@ -168,90 +192,13 @@ class RecordingWriter:
         if self.count == 0:
             self._raw_path.unlink(missing_ok=True)
         elif not joined:
-            recover(self.path, invalid)
+            recover(self.path)
 
     def __enter__(self) -> RecordingWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
-
-
-def recover(path: str | Path, invalid: Collection[int] = ()) -> int:
-    """Finish an interrupted recording: join the pixels beside `path` into it. Returns the number of frames.
-
-    The frames `invalid` get the ImageStatus INVALID.
-
-    Raises
-    ------
-    InputError
-        There is no interrupted recording, it holds no whole frame, or the disk cannot take the file.
-    """
-    target = _checked_target(path)
-    raw = pixels_beside(target)
-    if not target.is_file():
-        raise InputError(f"{target}: no such file; nothing to recover")
-    if not raw.is_file() and _is_whole(target):
-        return _whole_frames(target, None)[0]  # it was not interrupted, or held poses only
-    if not raw.is_file():
-        raise InputError(f"{target}: its pixel file {raw.name} is missing; nothing to recover")
-    count, samples = _whole_frames(target, raw)
-    if count == 0:
-        raise InputError(f"{target}: holds no whole frame; remove it and record again")
-    try:
-        with written_whole(target) as temporary, temporary.open("wb") as file:
-            for line in _lines_of_frames(target, count):
-                done = FRAME_DONE.fullmatch(line)
-                if done and int(done[1]) in invalid:
-                    file.write(b"Seq_Frame%s_ImageStatus = INVALID\n" % done[1])
-                file.write(_dim_size(samples, count) if line.startswith(b"DimSize") else line)
-            file.write(b"ElementDataFile = LOCAL\n")
-            with raw.open("rb") as pixels:
-                _copy(pixels, file, count * samples * 2)
-    except OSError as error:
-        raise InputError(f"cannot write {target}: {error.strerror}; it still holds the recording, with {raw.name}") from None
-    raw.unlink()
-    return count
-
-
-def put_aside(path: str | Path) -> Optional[Path]:
-    """Make room for a recording: an earlier one is renamed (see `files.set_aside`), joined first if it was interrupted.
-
-    Returns its new path, None if there is none.
-
-    Raises
-    ------
-    InputError
-        The path is none of a recording, or the folder cannot be written to.
-    """
-    target = _checked_target(path)
-    raw = pixels_beside(target)
-    try:
-        if raw.is_file():
-            try:
-                recover(target)
-            except InputError:  # no whole frame, or pixels without their header: kept as they are
-                set_aside(raw)
-        return set_aside(target)
-    except OSError as error:
-        raise InputError(f"cannot write {target}: {error.strerror}; choose a folder that exists and is writable") from None
-
-
-def _is_whole(path: Path) -> bool:
-    """Whether a file's pixels are its own."""
-    if path.is_file():
-        with path.open("rb") as file:
-            for line in file:
-                if line.startswith(b"ElementDataFile"):
-                    return line.split()[-1:] == [b"LOCAL"]
-    return False
-
-
-def _checked_target(path: str | Path) -> Path:
-    target = Path(path)
-    if not target.name.lower().endswith(".mha"):
-        raise InputError(f"{target}: recordings are written as .igs.mha; give a name with that ending")
-    return target
 
 
 def _write_at(handle: int, data: bytes, offset: int) -> None:
@@ -265,43 +212,6 @@ def _seek_write(handle: int, data: bytes, offset: int) -> int:
     return os.write(handle, data)
 
 
-def _copy(source: BinaryIO, target: BinaryIO, size: int) -> None:
-    while size:
-        data = source.read(min(size, 1 << 20))
-        if not data:
-            raise OSError(5, "the pixel file became shorter")
-        target.write(data)
-        size -= len(data)
-
-
-def _whole_frames(path: Path, raw: Optional[Path]) -> tuple[int, int]:
-    """Frames whose fields and pixels are both complete, and samples a line."""
-    count = samples = 0
-    with path.open("rb") as file:
-        for line in file:
-            if line.startswith(b"ElementDataFile"):
-                break
-            if line.startswith(b"DimSize"):
-                samples = int(line.split()[2])
-            count += FRAME_DONE.fullmatch(line) is not None
-    return (min(count, raw.stat().st_size // (2 * samples)) if raw is not None and samples else count), samples
-
-
-def _lines_of_frames(path: Path, count: int) -> Iterator[bytes]:
-    """The header up to and with the fields of frame count - 1."""
-    with path.open("rb") as file:
-        for line in file:
-            yield line
-            done = FRAME_DONE.fullmatch(line)
-            if done and int(done[1]) == count - 1:
-                return
-
-
-def _dim_size(samples: int, count: int) -> bytes:
-    size = f"{samples} 1 {count}" if samples else f"0 0 {count}"
-    return f"DimSize = {size:<{PAD}}\n".encode("ascii")
-
-
 def _global_header(samples: int, count: int, acquisition: Optional[Acquisition], fields: Mapping[str, str]) -> bytes:
     kind = "MET_SHORT" if samples else "MET_UCHAR"
     lines = [
@@ -312,7 +222,7 @@ def _global_header(samples: int, count: int, acquisition: Optional[Acquisition],
         "BinaryDataByteOrderMSB = False",
         "CenterOfRotation = 0 0 0",
         "CompressedData = False",
-        _dim_size(samples, count).decode("ascii").rstrip("\n"),
+        dim_size(samples, count).decode("ascii").rstrip("\n"),
         "ElementNumberOfChannels = 1",
         "ElementSpacing = 1 1 1",
         f"ElementType = {kind}",

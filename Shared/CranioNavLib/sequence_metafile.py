@@ -6,7 +6,8 @@ One RF line a frame (`DimSize = N 1 F`, MET_SHORT), with pose, status and time a
 from __future__ import annotations
 
 from CranioNavLib.metafile_reader import read_recording
-from CranioNavLib.metafile_writer import RecordingWriter, put_aside, recover, write_recording
+from CranioNavLib.metafile_recovery import put_aside, recover
+from CranioNavLib.metafile_writer import RecordingWriter, write_recording
 from CranioNavLib.recording import Acquisition, Recording, pixels_beside
 
 __all__ = [

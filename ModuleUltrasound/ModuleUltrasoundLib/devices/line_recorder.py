@@ -26,7 +26,6 @@ class LineRecorder:
         self.points: set[int] = set()  # of the protocol, with a pose
         self._frames: dict[int, list[int]] = {}  # of each point
         self._taken_back: dict[int, float] = {}  # when a point was
-        self._invalid: set[int] = set()  # frames of points taken back
         self._writer = RecordingWriter(path, len(first.samples), acquisition)
 
     @property
@@ -39,9 +38,8 @@ class LineRecorder:
         if item.line.host_time_s <= self.start_s and self.lines:
             return
         pose, point = item.pose, item.palpation_point
-        if item.line.host_time_s < self._taken_back.get(point, 0.0):
-            self._invalid.add(self.lines)
-        else:
+        late = item.line.host_time_s < self._taken_back.get(point, 0.0)  # it was on its way when the point was taken back
+        if not late:
             self._frames.setdefault(point, []).append(self.lines)
         self._writer.append(
             max(0.0, item.line.host_time_s - self.start_s),
@@ -49,16 +47,18 @@ class LineRecorder:
             {"ProbeToReference": "OK" if pose.usable else status_word(pose.status)},
             item.line.samples,
             point,
+            late,
         )
         if pose.usable:
             self.points.add(point)
 
     def take_back(self, point: int, host_time_s: float) -> None:
-        """The lines of a point up to now are none of it: they stay in the file, marked as invalid when it is finished."""
-        self._invalid.update(self._frames.pop(point, ()))
+        """The lines of a point up to now are none of it: they stay in the file, marked as invalid at once, for a killed
+        process to leave them so."""
         self._taken_back[point] = host_time_s
         self.points.discard(point)
+        self._writer.mark_invalid(self._frames.pop(point, ()))
 
     def close(self) -> None:
         """Finish the file."""
-        self._writer.close(self._invalid)
+        self._writer.close()

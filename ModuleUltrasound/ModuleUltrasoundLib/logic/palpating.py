@@ -153,9 +153,9 @@ class PalpationStep(SweepStep, MeasureStep):
             return None
         self.goTo(point.target)
         self._restsUntil = self._changes[-1][0]
+        self._showTaken(self.palpation)
         if self.recorder is not None:
             self.recorder.take_back(point.target, self._changes[-1][0])
-        self._showTaken(self.palpation)
         return f"{point.label} taken back"
 
     def undoPointBlocked(self) -> str:

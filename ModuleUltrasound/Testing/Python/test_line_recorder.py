@@ -24,11 +24,13 @@ def test_lines_of_a_point_that_was_taken_back_are_kept_but_never_become_points(t
     assert recorder.points == {0}
     for time_s, point in ((100.4, 1), (100.6, 1)):  # the first was still on its way
         recorder.add(line_at(time_s, 7, point=point))
-    recorder.close()
-    recording = read_recording(path)
-    assert recording.statuses == ("OK", "INVALID", "INVALID", "INVALID", "OK")
-    assert recording.palpation_points.tolist() == [0, 1, 1, 1, 1]
-    assert (recording.lines == 7).all()
+    for killed in (True, False):  # before it could be finished
+        if not killed:
+            recorder.close()
+        recording = read_recording(path)
+        assert recording.statuses == ("OK", "INVALID", "INVALID", "INVALID", "OK")
+        assert recording.palpation_points.tolist() == [0, 1, 1, 1, 1]
+        assert (recording.lines == 7).all()
 
 
 def test_lines_are_timed_from_the_first_and_a_lost_pose_says_why(tmp_path):

@@ -203,6 +203,59 @@ def test_a_kill_between_any_two_writes_leaves_the_frames_before(tmp_path, monkey
     assert read_recording(writer.path).timestamps_s[2] == 0.2
 
 
+def test_a_line_taken_back_stays_so_when_the_process_is_killed(tmp_path):
+    path = tmp_path / "t.igs.mha"
+    writer, line = RecordingWriter(path, 4, ACQUISITION), np.arange(4, dtype=np.int16)
+    for k in range(12):
+        writer.append(k / 10, {"ProbeToReference": np.eye(4)}, line=line + k, invalid=k == 9)
+        if k == 5:
+            writer.mark_invalid((1, 5))
+    writer.mark_invalid((11,))
+    writer.mark_invalid(())
+    wanted = tuple("INVALID" if k in (1, 5, 9, 11) else "OK" for k in range(12))
+    for finished in (False, True):  # as a kill leaves it, and joined into one file
+        assert not finished or recover(path) == 12
+        recording = read_recording(path)
+        assert recording.statuses == wanted
+        np.testing.assert_array_equal(recording.lines, line + np.arange(12)[:, None])
+        image = SimpleITK.ReadImage(str(path))
+        assert image.GetSize()[2] == 12
+        assert {k for k in range(12) if image.HasMetaDataKey(f"Seq_Frame{k:04d}_ImageStatus")} == {1, 5, 9, 11}
+    before = path.read_bytes().partition(b"ElementDataFile")[0].decode("ascii").splitlines()
+    frames = [text.split("_")[1] for text in before if text.startswith("Seq_")]
+    assert frames == sorted(frames), "each stands with its frame in the end"
+
+
+@pytest.mark.skipif(not hasattr(os, "pwrite"), reason="kills at a stand-in for pwrite")
+@pytest.mark.parametrize("survived", [0, 1, 2])
+@pytest.mark.parametrize("marked", [(1,), range(40)])
+def test_a_kill_while_lines_are_taken_back_leaves_all_frames(tmp_path, monkeypatch, survived, marked):
+    path = tmp_path / "k.igs.mha"
+    writer = RecordingWriter(path, 4, ACQUISITION)
+    for k in range(40):
+        writer.append(k / 10, {"ProbeToReference": np.eye(4)}, line=np.arange(4, dtype=np.int16))
+    real, done = os.pwrite, []
+
+    def dying(handle: int, data: bytes, offset: int) -> int:
+        if len(done) == survived:
+            raise KeyboardInterrupt
+        done.append(offset)
+        return real(handle, data, offset)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "pwrite", dying)
+        if survived < 2:
+            with pytest.raises(KeyboardInterrupt):
+                writer.mark_invalid(marked)
+        else:
+            writer.mark_invalid(marked)
+    statuses = read_recording(path).statuses
+    assert len(statuses) == SimpleITK.ReadImage(str(path)).GetSize()[2] == 40
+    assert statuses.count("INVALID") == (len(marked) if survived == 2 else 0), "all of a point or none"
+    assert recover(path) == 40
+    assert read_recording(path).statuses == statuses
+
+
 def test_a_killed_process_loses_at_most_100_ms(tmp_path):
     code = (
         "import sys, time, numpy as np\n"
