@@ -47,7 +47,8 @@ class ModuleUltrasoundLogic(PalpationStep, ScriptedLoadableModuleLogic):
     """Lines of the device and the probe's pose in, bone points out; the owner of the event loop calls `poll`."""
 
     def poll(self):
-        """Take over the lines that came since the last call. Main thread only."""
+        """Take over the lines that came since the last call, and what has come into the probe's way. Main thread only."""
+        self.keepClear()
         if self.stream is None:
             return
         self.record(self.takeLines())

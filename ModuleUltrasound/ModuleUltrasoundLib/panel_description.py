@@ -11,6 +11,7 @@ from CranioNavLib.parameters import Limits, Parameters
 
 from ModuleUltrasoundLib.devices.device import AMODE_DEVICES
 from ModuleUltrasoundLib.measurement.measure import EchoSettings
+from ModuleUltrasoundLib.palpation.clamp import CLEARANCE_LIMITS, CLEARANCE_MM
 
 RECORDINGS = ("Recording (*.igs.mha *.igs.mhd *.mha)",)
 
@@ -47,6 +48,9 @@ class UltrasoundParameters(Parameters):
 
     device: Annotated[str, "where RF lines come from"] = "simulated"
     patient_lies: Annotated[PatientLies, "points that the table hides are asked for last"] = PatientLies.FREE
+    clamp_clearance_mm: Annotated[
+        float, CLEARANCE_LIMITS, "between the probe's axis and each pin of the clamp, and the middle of the reference base"
+    ] = CLEARANCE_MM
     palpate_by: Annotated[PalpateBy, "one point where the probe rests, or one every 2 mm of its way"] = PalpateBy.POINTS
     recording_path: Annotated[str, "recording to be measured, or to be written (.igs.mha)"] = ""
     speed_of_sound_m_s: Annotated[float, Limits(1300, 1800), "speed of sound in the scalp: mean of the prior"] = (
@@ -82,6 +86,7 @@ PANEL = Panel(
                 NodeField("LandmarksCT", "Landmarks in the CT"),
                 NodeField("ClampPins", "Pins of the head clamp"),
                 ParameterField("patient_lies", "The patient lies"),
+                ParameterField("clamp_clearance_mm", "Distance from clamp and base"),
                 ReadOut("clampPins", "Head clamp"),
                 Action("planProtocol", "Plan points", "Place the palpation points", primary=True),
                 ReadOut("currentPoint", "Palpate now", large=True),

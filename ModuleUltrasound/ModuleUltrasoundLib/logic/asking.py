@@ -9,7 +9,7 @@ import numpy.typing as npt
 from CranioNavLib import scene_data
 from CranioNavLib.panel import Reading
 
-from ModuleUltrasoundLib.logic.planning import clamp_pins, count_of, registered
+from ModuleUltrasoundLib.logic.planning import count_of, in_the_way, registered
 from ModuleUltrasoundLib.logic.probing import ProbeStep
 from ModuleUltrasoundLib.panel_description import TOWARDS_TABLE
 
@@ -27,6 +27,14 @@ class AskStep(ProbeStep):
         self.palpation: Optional[Palpation] = None  # which points have been taken, while recording
         self._passed: set[int] = set()  # left out for now: they come again after the others
         self._brings: Optional[NextTarget] = None  # what the point asked for is expected to bring
+
+    def recordsPoints(self) -> bool:
+        """Whether points are being palpated: the plan must stay as it is."""
+        return self.palpation is not None
+
+    def planProtocolBlocked(self) -> str:
+        """Why no points can be placed now."""
+        return "stop the recording first" if self.recordsPoints() else super().planProtocolBlocked()
 
     def beginAsking(self) -> None:
         """Every point is open again."""
@@ -81,12 +89,11 @@ class AskStep(ProbeStep):
 
     def _within_reach(self, plan: ProtocolPoints) -> npt.NDArray[np.bool_]:
         """A probe that would run into a pin of the head clamp, or into the reference base on it, cannot be held there."""
-        from ModuleUltrasoundLib.palpation.next_point import reachable
+        from ModuleUltrasoundLib.palpation.next_point import ReachSettings, reachable
 
-        clamp = scene_data.get_transform("ReferenceToRas")[:3, 3][None] if registered() else None
-        pins = clamp_pins()
-        clamp = clamp if pins is None else np.concatenate([pins, clamp])
-        return reachable(plan, clamp, TOWARDS_TABLE[self.parameters().read().patient_lies])
+        wanted = self.parameters().read()
+        distance = ReachSettings(clamp_clearance_mm=wanted.clamp_clearance_mm)
+        return reachable(plan, in_the_way(), TOWARDS_TABLE[wanted.patient_lies], distance)
 
     def _best(self, plan: ProtocolPoints, candidates: npt.NDArray[np.bool_], since: list[int]) -> Optional[NextTarget]:
         """By the error of the registration in force, with the points taken since it counted in; None where it is not known."""

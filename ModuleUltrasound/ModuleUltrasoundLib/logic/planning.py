@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import deque
+from dataclasses import dataclass
 from typing import Any, Optional
 
 import numpy as np
@@ -18,6 +20,7 @@ from ModuleUltrasoundLib.devices.device import DeviceError
 from ModuleUltrasoundLib.devices.line_stream import LineStream
 from ModuleUltrasoundLib.panel_description import UltrasoundParameters
 
+LOG = logging.getLogger(__name__)
 CHANGES = 16  # of the point asked for that are remembered: no line waits for longer
 CURRENT_POINT = "current"  # parameter of the Protocol node: index of the point to palpate now
 NORMALS = ("Normal_R", "Normal_A", "Normal_S")  # measurements of ProtocolPoints: outward normals of the bone
@@ -34,36 +37,81 @@ class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
     def __init__(self, parent: Any = None) -> None:
         super().__init__(parent)
         self._changes: deque[tuple[float, int]] = deque(maxlen=CHANGES)  # when another point was asked for, and which was before
+        self._around: Optional[_Around] = None  # what the plan was last held to
+        self._plannedAnew = False  # by itself, because of it
 
     def planProtocol(self) -> str:
         """Place the palpation points on the outer table; writes ProtocolPoints and Protocol. Returns a message."""
         from ModuleUltrasoundLib.palpation.protocol import plan_protocol
 
+        around = self._whatIsAround()
         landmarks = scene_data.get_points("LandmarksCT") if count_of("LandmarksCT") else None
         planned = plan_protocol(
             scene_data.get_surface("OuterTable"),
             landmarks.positions_mm if landmarks else None,
             landmarks.labels if landmarks else None,
-            clamp_pins(),
+            around.places_mm,
+            around.clearance_mm,
         )
         node = scene_data.set_points("ProtocolPoints", LabelledPoints(planned.labels, planned.positions_ras_mm))
         for axis, name in enumerate(NORMALS):
             scene_data.add_measurement(node, name, planned.normals[:, axis])
         self.goTo(0)
+        self._around, self._plannedAnew = around, False
         missing = f"; no place to stand for {', '.join(planned.left_out)}" if planned.left_out else ""
         return f"{len(planned.labels)} points{missing}"
 
-    def clampPins(self) -> Reading:
-        """How many pins of the head clamp are known, and how far the points keep from them."""
-        from ModuleUltrasoundLib.palpation.clamp import CLEARANCE_MM
+    def keepClear(self) -> None:
+        """Plan anew once a pin or the reference base is known to be in the way of a point, as long as none was palpated.
 
-        count = count_of("ClampPins")
-        if not count:
-            return Reading("no pins known; touch them with the stylus to keep away from them")
-        known = f"{count} pin{'s' if count > 1 else ''}"
-        if clamp_pins() is None:
-            return Reading(f"{known}; where they are on the head is known once the landmarks are registered", Level.WARNING)
-        return Reading(f"{known}; the probe keeps {CLEARANCE_MM:.0f} mm away", Level.GOOD)
+        Called again and again by the owner of the event loop. Points that were taken stay where they are; those that are out
+        of reach are asked for last. Where another plan is refused, the one that there is stays.
+        """
+        if not count_of("ProtocolPoints") or self.recordsPoints():
+            return
+        before, now = self._around, self._whatIsAround()
+        if now == before:
+            return
+        self._around = now
+        other_distance = before is not None and before.clearance_mm != now.clearance_mm
+        try:
+            if (self._tooNear(now) or other_distance) and not count_of("SurfacePoints"):
+                self.planProtocol()
+                self._plannedAnew = True
+        except InputError as error:
+            LOG.warning("the points stay where they are: %s", error)
+
+    def recordsPoints(self) -> bool:
+        """Whether points are being palpated: the plan must stay as it is."""
+        return False
+
+    def _whatIsAround(self) -> _Around:
+        return _Around(in_the_way(), self.parameters().read().clamp_clearance_mm)
+
+    def _tooNear(self, around: _Around) -> int:
+        """How many points of the plan do not keep clear of it."""
+        from ModuleUltrasoundLib.palpation.clamp import clear_of_clamp
+
+        if not count_of("ProtocolPoints"):
+            return 0
+        positions, normals, _ = self.protocolPoints()
+        return int(np.sum(~clear_of_clamp(positions, normals, around.places_mm, around.clearance_mm)))
+
+    def clampPins(self) -> Reading:
+        """What is known of the head clamp and the reference base, how far the points keep from them, and how many do not."""
+        count, around = count_of("ClampPins"), self._whatIsAround()
+        pins = f"{count} pin{'s' if count > 1 else ''}"
+        if around.places_mm is None:
+            if not count:
+                return Reading("no pins known; touch them with the stylus to keep away from them")
+            return Reading(f"{pins}; where they are on the head is known once the landmarks are registered", Level.WARNING)
+        known = f"{pins} and the reference base" if count else "no pins known (touch them with the stylus), the reference base"
+        said = f"{known}; the probe keeps {around.clearance_mm:g} mm away"
+        near = self._tooNear(around)
+        if near:
+            stands = "1 point stands" if near == 1 else f"{near} points stand"
+            return Reading(f"{said}; {stands} nearer and will be asked for last", Level.WARNING)
+        return Reading(said + ("; the points were planned anew" if self._plannedAnew else ""), Level.GOOD)
 
     def planProtocolBlocked(self) -> str:
         """Why no points can be placed now."""
@@ -139,6 +187,29 @@ def registered() -> bool:
     """Whether ReferenceToRas is a registration."""
     node = scene.find("ReferenceToRas")
     return node is not None and bool(node.GetAttribute(scene.STATUS_ATTRIBUTE))
+
+
+@dataclass(frozen=True, eq=False)
+class _Around:
+    """What a plan has to keep clear of."""
+
+    places_mm: Optional[Array]  # (K, 3) RAS: the pins that are known, and the reference base; None before the registration
+    clearance_mm: float
+
+    def __eq__(self, other: object) -> bool:
+        """The same places to the digit, and the same distance."""
+        if not isinstance(other, _Around) or self.clearance_mm != other.clearance_mm:
+            return False
+        one, another = self.places_mm, other.places_mm
+        return one is another or (one is not None and another is not None and np.array_equal(one, another))
+
+
+def in_the_way() -> Optional[Array]:
+    """(K, 3) RAS: the pins of the head clamp that are known, and the reference base; None while no registration places them."""
+    if not registered():
+        return None
+    base, pins = scene_data.get_transform("ReferenceToRas")[:3, 3][None], clamp_pins()
+    return base if pins is None else np.concatenate([pins, base])
 
 
 def clamp_pins() -> Optional[Array]:

@@ -1,4 +1,4 @@
-"""The head clamp: where a probe would run into its pins or arms."""
+"""What is in the probe's way: pins and arms of the head clamp, and the reference base fixed to it."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from typing import Optional
 
 import numpy as np
 import numpy.typing as npt
+from CranioNavLib.parameters import Limits
 from CranioNavLib.rigid import Array, check_points
 
 PROBE_LENGTH_MM = 150.0  # what a probe with the hand takes up outside the head
 CLEARANCE_MM = 30.0  # between the probe's axis and a pin: half a hand's width
+CLEARANCE_LIMITS = Limits(0, 100)  # a whole hand away there would be no place left on a side of the head that has a pin
 
 
 def clear_of_clamp(
@@ -22,7 +24,7 @@ def clear_of_clamp(
     feet_mm, normals : arrays, shape (N, 3)
         Where it stands, and the outward unit normals along which it is held.
     clamp_mm : array-like, shape (K, 3), or None
-        Points on the clamp (pins, arms), in the same frame.
+        Points on the clamp (pins, arms, reference base), in the same frame.
     clearance_mm : float
         Least distance from the probe's axis, which is `PROBE_LENGTH_MM` long.
     """

@@ -14,7 +14,7 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.parameters import Limits, Parameters
 from CranioNavLib.rigid import Array, check_points
 
-from ModuleUltrasoundLib.palpation.clamp import CLEARANCE_MM, clear_of_clamp
+from ModuleUltrasoundLib.palpation.clamp import CLEARANCE_LIMITS, CLEARANCE_MM, clear_of_clamp
 from ModuleUltrasoundLib.palpation.protocol import ProtocolPoints
 
 
@@ -22,7 +22,7 @@ from ModuleUltrasoundLib.palpation.protocol import ProtocolPoints
 class ReachSettings(Parameters):
     """What is in the way of the probe, and what a point is worth."""
 
-    clamp_clearance_mm: Annotated[float, Limits(0, 200), "between the probe and any part of the head clamp"] = CLEARANCE_MM
+    clamp_clearance_mm: Annotated[float, CLEARANCE_LIMITS, "between the probe's axis and clamp or base"] = CLEARANCE_MM
     point_sd_mm: Annotated[float, Limits(0.05, 10), "expected error of a point along the bone's normal"] = 0.6
     support_angle_deg: Annotated[float, Limits(0, 90), "normals nearer than this to the table's direction are out of reach"] = (
         50.0
@@ -141,7 +141,7 @@ def reachable(
     ----------
     points : ProtocolPoints
     clamp_ras_mm : array-like, shape (K, 3), optional
-        Points on the head clamp (pins, arms), touched with the stylus or known.
+        Points on the head clamp (pins, arms, reference base), touched with the stylus or known.
     table_direction_ras : array-like, shape (3,), optional
         From the head towards the table; (0, -1, 0) for a patient lying on the back.
     settings : ReachSettings, optional

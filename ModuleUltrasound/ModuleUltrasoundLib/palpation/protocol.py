@@ -17,7 +17,7 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array, invert_rigid, transform_directions, transform_points
 from CranioNavLib.surface import Surface
 
-from ModuleUltrasoundLib.palpation.clamp import clear_of_clamp
+from ModuleUltrasoundLib.palpation.clamp import CLEARANCE_MM, clear_of_clamp
 from ModuleUltrasoundLib.palpation.head_frame import head_frame
 
 REGIONS = ("Left lateral", "Right lateral", "Frontal convexity", "Forehead", "Periorbital")
@@ -51,6 +51,8 @@ HEAD_RADIUS_MM = 75.0
 ROUGHNESS_WEIGHT = 0.05  # mm^2 of predicted error that an ideal place is worth against one at a window's rim
 PRIOR_SD_MM = 3.0  # landmark registration, per axis; keeps the information regular with few points
 
+_Obstacles = tuple[Optional[npt.ArrayLike], float]  # points in the probe's way, RAS, and the distance to keep from them
+
 
 @dataclass(frozen=True, eq=False)
 class ProtocolPoints:
@@ -61,7 +63,7 @@ class ProtocolPoints:
     normals: Array  # (N, 3) unit, of the plane through the bone under the probe
     regions: tuple[str, ...]
     head_to_ras: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) origin at the nasion, x right, y anterior, z up
-    left_out: tuple[str, ...] = ()  # labels of points whose place is taken by an opening of the skull or the clamp
+    left_out: tuple[str, ...] = ()  # labels of points whose place is taken by an opening of the skull, the clamp or the base
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -82,6 +84,7 @@ def plan_protocol(
     landmarks_ras_mm: Optional[npt.ArrayLike] = None,
     labels: Optional[Sequence[str]] = None,
     clamp_ras_mm: Optional[npt.ArrayLike] = None,
+    clearance_mm: float = CLEARANCE_MM,
 ) -> ProtocolPoints:
     """The 18 points of the protocol on a skull.
 
@@ -95,13 +98,15 @@ def plan_protocol(
     labels : sequence of str, optional
         Names of the landmarks.
     clamp_ras_mm : array-like, shape (K, 3), optional
-        Points on the head clamp that a probe has to keep clear of.
+        Points on the head clamp, and the reference base on it, that a probe has to keep clear of.
+    clearance_mm : float
+        How far: between each of them and the probe's axis.
 
     Returns
     -------
     ProtocolPoints
         Three left lateral, three right lateral, four each on frontal convexity, forehead and around the orbits; without
-        those whose place, and all around it, is an opening of the skull or under the clamp.
+        those whose place, and all around it, is an opening of the skull or under clamp or base.
 
     Raises
     ------
@@ -111,9 +116,10 @@ def plan_protocol(
     head_to_ras = head_frame(surface, landmarks_ras_mm, labels)
     center, reach = _middle(surface, head_to_ras)
     windows: dict[tuple[str, int], list[_Spot]] = {}
+    obstacles = (clamp_ras_mm, clearance_mm)
     for name in PAIRS:
         for side in (-1, 1):
-            windows[name, side] = _spots_for(surface, head_to_ras, center, reach, name, side, clamp_ras_mm)
+            windows[name, side] = _spots_for(surface, head_to_ras, center, reach, name, side, obstacles)
     left_out = _check_left_out(windows)
     windows = {key: spots for key, spots in windows.items() if spots}
     chosen = _choose(windows, center)
@@ -143,7 +149,8 @@ def _check_left_out(windows: dict[tuple[str, int], list[_Spot]]) -> list[tuple[s
         name, side = empty[0]
         raise InputError(
             f"no place for the probe at {'left' if side < 0 else 'right'} {name.lower()}: the bone surface is missing or too "
-            "rough there, or the clamp is in the way; extend or mend the surface, or check the landmarks that orient the head"
+            "rough there, or the clamp or the reference base is in the way; extend or mend the surface, check the landmarks that "
+            "orient the head, or lessen the distance from clamp and base"
         )
     return empty
 
@@ -182,7 +189,7 @@ def _directions(name: str, side: int, radius_deg: float) -> tuple[Array, list[tu
 
 
 def _spots_for(
-    surface: Surface, head_to_ras: Array, center: Array, reach: float, name: str, side: int, clamp: Optional[npt.ArrayLike]
+    surface: Surface, head_to_ras: Array, center: Array, reach: float, name: str, side: int, obstacles: _Obstacles
 ) -> list[_Spot]:
     """Places of a window where a probe can stand; the window grows until it holds some, or is left empty."""
     for radius_deg in WINDOW_RADII_DEG:
@@ -197,7 +204,7 @@ def _spots_for(
         kept = [place for place, flag in zip(places, seen) if flag]
         spots = [
             _Spot(positions[k], normals[k], kept[k], 0.02 * float(np.hypot(*kept[k])) + 0.5 * float(roughness[k]))
-            for k in np.flatnonzero(good & clear_of_clamp(positions, normals, clamp))
+            for k in np.flatnonzero(good & clear_of_clamp(positions, normals, *obstacles))
         ]
         if spots:
             return spots

@@ -136,6 +136,16 @@ def test_points_keep_clear_of_the_pins_of_the_head_clamp(a_skull):
     assert len(plan.left_out) <= 1, "a window that holds a pin is widened"
 
 
+def test_points_keep_the_distance_that_is_asked_for(a_skull):
+    free = plan_protocol(a_skull, LANDMARKS)
+    base = free.positions_ras_mm[:1] + 50.0 * free.normals[:1]  # before the hand
+    for clearance_mm in (10.0, 45.0):
+        plan = plan_protocol(a_skull, LANDMARKS, clamp_ras_mm=base, clearance_mm=clearance_mm)
+        assert clear_of_clamp(plan.positions_ras_mm, plan.normals, base, clearance_mm).all()
+    with pytest.raises(InputError, match="lessen the distance from clamp and base"):
+        plan_protocol(a_skull, LANDMARKS, clamp_ras_mm=free.positions_ras_mm, clearance_mm=90.0)
+
+
 def test_an_open_face_without_the_back_of_the_head_is_enough():
     plan = plan_protocol(a_head(lambda middles: middles[:, 1] > -150.0), LANDMARKS)
     assert len(plan) == 18
