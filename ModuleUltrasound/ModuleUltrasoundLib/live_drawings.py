@@ -1,7 +1,9 @@
-"""Live drawings: the A-line with gate, skin and echo, and the bull's-eye of the tilt, as numbers and as SVG."""
+"""Live drawings: the A-line with gate, skin and echo, the bull's-eye of the tilt, the points taken, as numbers and as SVG."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from enum import Enum
 from typing import TYPE_CHECKING, Any, Optional
 
 import numpy as np
@@ -16,8 +18,26 @@ if TYPE_CHECKING:
 WIDTH, HEIGHT = 300, 76  # of the A-line's drawing
 COLUMNS = 150
 BULLS_EYE_DEG, RIM = 15.0, 45  # tilt at the rim, and the rim's radius in a drawing of 100 by 100
+DOTS_A_ROW, DOT_PITCH, DOT_RADIUS = 9, WIDTH / 9, 12.5  # of the points of the protocol: two rows of nine
 AROUND_MM = 4.0  # of tissue shown before the skin and below the deepest bone
 GROUND, GATE, GOOD, WARNING, BLUE, PALE = "#10151b", "#1f2c3a", "#2fbf8f", "#f0b429", "#6cb8f0", "#cfd8dc"
+DARK, GREY = "#06251b", "#90a4ae"
+
+
+class PointState(str, Enum):
+    """How far a point of the protocol is."""
+
+    TAKEN = "taken"
+    NOW = "now"  # asked for
+    OPEN = "open"
+
+
+# Of a dot: fill, stroke, its width, colour and weight of its number. Told apart without colour, too: full, thick ring, thin ring.
+DOTS = {
+    PointState.TAKEN: (GOOD, GOOD, 2, DARK, "bold"),
+    PointState.NOW: ("none", WARNING, 4, WARNING, "bold"),
+    PointState.OPEN: ("none", GREY, 1.5, PALE, "normal"),
+}
 
 
 def a_line(live: Optional[Live], settings: EchoSettings) -> Optional[dict[str, Any]]:
@@ -117,3 +137,24 @@ def draw_bulls_eye(eye: dict[str, Any]) -> str:
         '<path d="M50 4V96M4 50H96" stroke="#37474f"/>'
         f'<circle cx="{eye["x"]}" cy="{eye["y"]}" r="5" fill="{color}"/></svg>'
     )
+
+
+def draw_points(states: Sequence[PointState]) -> Optional[str]:
+    """The points of the protocol as numbered dots in rows of nine, as SVG; None without points."""
+    if not states:
+        return None
+    height = DOT_PITCH * (1 + (len(states) - 1) // DOTS_A_ROW)
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{height:.1f}" viewBox="0 0 {WIDTH} {height:.1f}">',
+        f'<rect width="{WIDTH}" height="{height:.1f}" fill="{GROUND}"/>',
+    ]
+    for index, state in enumerate(states):
+        row, column = divmod(index, DOTS_A_ROW)
+        x, y = (column + 0.5) * DOT_PITCH, (row + 0.5) * DOT_PITCH
+        fill, stroke, width, ink, weight = DOTS[state]
+        parts.append(
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{DOT_RADIUS}" fill="{fill}" stroke="{stroke}" stroke-width="{width}"/>'
+            f'<text x="{x:.1f}" y="{y + 4.5:.1f}" font-family="sans-serif" font-size="13" font-weight="{weight}" fill="{ink}" '
+            f'text-anchor="middle">{index + 1}</text>'
+        )
+    return "".join([*parts, "</svg>"])

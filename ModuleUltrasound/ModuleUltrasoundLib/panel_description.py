@@ -122,6 +122,9 @@ PANEL = Panel(
                 Action("stopRecording", "Stop the recording", "Finish the file and measure it"),
                 ReadOut("guidance", "Do now", large=True),
                 Picture("bullsEye", "Where the probe's back end stands off the upright, seen from outside", on_page=False),
+                Picture(
+                    "pointsDrawn", "The points of the protocol: full ones are taken, the thick ring is asked for", on_page=False
+                ),
                 ReadOut("brings", "Predicted error with this point", "mm"),
                 ReadOut("tilt", "Tilt off the upright", "°", large=True),
                 ReadOut("dwell", "Taken"),

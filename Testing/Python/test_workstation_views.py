@@ -277,16 +277,16 @@ def test_the_skull_is_not_coloured_by_another_registrations_error_while_its_own_
     assert len(waiting) == 2
 
 
-def test_points_are_counted_while_they_are_palpated_and_not_during_a_sweep(an_empty_scene):
+def test_the_dots_of_the_points_carry_their_names(an_empty_scene):
     from types import SimpleNamespace
+
+    from ModuleUltrasoundLib.live_drawings import PointState
 
     from Workstation.web.drawings import progress
 
     scene_data.set_points("ProtocolPoints", LabelledPoints(("a", "b", "c"), np.eye(3)))
-    logic = SimpleNamespace(sweep=None, recorded=lambda: "12 lines", taken=lambda: ["a"], currentIndex=lambda: 2)
-    assert [one["state"] for one in progress(logic)] == ["taken", "open", "now"]
-    logic.sweep = object()
-    assert progress(logic) == []
+    logic = SimpleNamespace(pointStates=lambda: [PointState.TAKEN, PointState.OPEN, PointState.NOW])
+    assert progress(logic) == [{"label": "a", "state": "taken"}, {"label": "b", "state": "open"}, {"label": "c", "state": "now"}]
 
 
 def test_the_ring_has_the_size_of_the_error_and_goes_without_one(an_empty_scene):

@@ -9,17 +9,10 @@ from ModuleUltrasoundLib.live_drawings import a_line, bulls_eye
 
 
 def progress(logic: Any) -> list[dict[str, Any]]:
-    """One entry a planned point: taken, asked for, or open; none while a sweep is recorded, which asks for no point."""
+    """One entry a planned point: its name, and whether it is taken, asked for, or open."""
     node = scene.find("ProtocolPoints")
-    if node is None or logic.sweep is not None:
-        return []
-    if logic.recorded() is None and scene.find("SurfacePoints") is not None:
-        return []  # palpated and measured
-    taken, current = set(logic.taken()), logic.currentIndex()
-    labels = [node.GetNthControlPointLabel(index) for index in range(node.GetNumberOfControlPoints())]
     return [
-        {"label": label, "state": "taken" if label in taken else "now" if index == current else "open"}
-        for index, label in enumerate(labels)
+        {"label": node.GetNthControlPointLabel(index), "state": state.value} for index, state in enumerate(logic.pointStates())
     ]
 
 

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from CranioNavLib import scene_data
 from CranioNavLib.panel import Reading
 
+from ModuleUltrasoundLib.live_drawings import PointState, draw_points
 from ModuleUltrasoundLib.logic.planning import count_of, in_the_way, registered
 from ModuleUltrasoundLib.logic.probing import ProbeStep
 from ModuleUltrasoundLib.panel_description import TOWARDS_TABLE
@@ -77,6 +78,22 @@ class AskStep(ProbeStep):
         if best is None or palpation is None or best.index != self.currentIndex() or not any(palpation.open_points):
             return None
         return Reading(f"{best.tre_now_mm:.1f} → {best.tre_then_mm:.1f}")
+
+    def pointStates(self) -> list[PointState]:
+        """How far each planned point is; none once they are palpated and measured."""
+        count, palpation = count_of("ProtocolPoints"), self.palpation
+        if palpation is None and count_of("SurfacePoints"):
+            return []
+        is_open = palpation.open_points if palpation is not None else [True] * count
+        now = self.currentIndex()
+        return [
+            PointState.TAKEN if not is_open[index] else PointState.NOW if index == now else PointState.OPEN
+            for index in range(min(count, len(is_open)))
+        ]
+
+    def pointsDrawn(self) -> Optional[str]:
+        """A drawing of how far each point is; None where none is asked for."""
+        return draw_points(self.pointStates())
 
     def _left_out(self, count: int) -> npt.NDArray[np.bool_]:
         return np.isin(np.arange(count), list(self._passed))

@@ -9,6 +9,7 @@ from CranioNavLib import scene_data
 from CranioNavLib.panel import Level, Reading
 from CranioNavLib.rigid import Array
 
+from ModuleUltrasoundLib.live_drawings import PointState
 from ModuleUltrasoundLib.logic.asking import AskStep
 
 if TYPE_CHECKING:
@@ -36,6 +37,10 @@ class SweepStep(AskStep):
     def indexAt(self, host_time_s: float) -> int:
         """Index of the point that was asked for at a moment; -1 for all lines of a recording of a gliding probe."""
         return -1 if self.sweep is not None else super().indexAt(host_time_s)
+
+    def pointStates(self) -> list[PointState]:
+        """How far each planned point is; none while the probe glides, for none is asked for."""
+        return [] if self.sweep is not None else super().pointStates()
 
     def aimAt(self, probe_to_ras: Array, surface: Surface) -> Optional[tuple[Array, Array]]:
         """While the probe glides it is where it has to be; it only has to stand upright on the bone."""

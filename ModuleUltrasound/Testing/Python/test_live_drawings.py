@@ -7,7 +7,16 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from ModuleUltrasoundLib.live_drawings import HEIGHT, WIDTH, a_line, bulls_eye, draw_a_line, draw_bulls_eye
+from ModuleUltrasoundLib.live_drawings import (
+    HEIGHT,
+    WIDTH,
+    PointState,
+    a_line,
+    bulls_eye,
+    draw_a_line,
+    draw_bulls_eye,
+    draw_points,
+)
 from ModuleUltrasoundLib.measurement.measure import EchoSettings
 
 RATE_HZ, SKIN_S, SETTINGS = 50e6, 10e-6, EchoSettings(speed_of_sound_m_s=1500.0, most_depth_mm=20.0)
@@ -57,6 +66,27 @@ def test_the_bulls_eye_has_right_at_its_right_up_at_its_top_and_an_end(tilt_deg,
     assert eye["good"] is aligned
     assert bulls_eye(guide, a_live_line(accepted=False))["good"] is False
     assert bulls_eye(None, None) is None
+
+
+@pytest.mark.parametrize("count", [1, 9, 10, 17, 18])
+def test_there_is_a_numbered_dot_a_point_inside_the_frame_and_none_over_another(count):
+    svg = draw_points([PointState.TAKEN] * (count - 1) + [PointState.NOW])
+    dots = np.array([[float(dot[key]) for key in ("cx", "cy", "r")] for dot in places(svg, "circle")])
+    frame = ElementTree.fromstring(svg).attrib
+    assert [one.text for one in ElementTree.fromstring(svg) if one.tag.endswith("text")] == [str(k + 1) for k in range(count)]
+    assert len(dots) == count
+    assert (dots[:, :2] - dots[:, 2:] > 0).all()
+    assert (dots[:, :2] + dots[:, 2:] < [float(frame["width"]), float(frame["height"])]).all()
+    gaps = np.linalg.norm(dots[:, None, :2] - dots[None, :, :2], axis=2) + 1e3 * np.eye(count)
+    assert gaps.min() > 2 * dots[0, 2] + 2 or count == 1
+
+
+def test_taken_asked_for_and_open_points_differ_by_more_than_their_colour():
+    taken, now, still_open = places(draw_points([PointState.TAKEN, PointState.NOW, PointState.OPEN]), "circle")
+    assert taken["fill"] != "none"
+    assert now["fill"] == still_open["fill"] == "none"
+    assert float(now["stroke-width"]) > float(still_open["stroke-width"])
+    assert draw_points([]) is None
 
 
 def test_nothing_is_drawn_outside_the_frame():
