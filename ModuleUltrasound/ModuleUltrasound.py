@@ -42,6 +42,14 @@ class ModuleUltrasoundWidget(PanelOfDevice, ScriptedLoadableModuleWidget):
         """The module's logic."""
         return ModuleUltrasoundLogic()
 
+    def palpated(self):
+        """Points taken in the recording under way."""
+        return len(self.logic.taken())
+
+    def probeGuide(self):
+        """Where the probe stands to its point, while this module is shown."""
+        return self.logic.guide() if self.isOpen else None
+
 
 class ModuleUltrasoundLogic(PalpationStep, ScriptedLoadableModuleLogic):
     """Lines of the device and the probe's pose in, bone points out; the owner of the event loop calls `poll`."""

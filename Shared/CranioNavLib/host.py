@@ -131,6 +131,28 @@ def check_thread() -> None:
         )
 
 
+def sound_effect_class() -> Any | None:
+    """QSoundEffect of Qt Multimedia: the application's, or PySide6's where its add-ons are installed; None where it lacks.
+
+    3D Slicer wraps it for Python since 5.0; builds of one's own may have left Qt Multimedia out.
+    """
+    try:
+        home = importlib.import_module("qt" if in_application() else "PySide6.QtMultimedia")
+    except ImportError:
+        return None
+    return getattr(home, "QSoundEffect", None)
+
+
+def beep() -> None:
+    """The computer's own beep; silent where there is no Qt, and where the computer's settings say so."""
+    try:
+        application: Any = importlib.import_module("qt" if in_application() else "PySide6.QtWidgets").QApplication
+    except (ImportError, AttributeError):
+        return
+    if in_application() or application.instance() is not None:
+        application.beep()
+
+
 @contextmanager
 def quiet() -> Iterator[Any]:
     """What VTK and MRML would print is kept; the object given has it as `GetOutput()`, for an exception's message."""

@@ -25,6 +25,7 @@ from CranioNavLib.panel import (
 from CranioNavLib.panel_model import PanelModel
 from CranioNavLib.panel_qt_widgets import Chooser, Drawing, Editor, NodeChooser, Section, ThreadRunner, connect, toolkit
 from CranioNavLib.parameters import ParameterInfo
+from CranioNavLib.sounds import SoundParameters, sound_parameters, sounds_are_on
 
 REFRESH_MS = 200  # live read-outs; poses are drawn by the views, not here
 STATE_SIGNS = {StepState.TODO: "○", StepState.DONE: "✓", StepState.ATTENTION: "!"}
@@ -98,6 +99,7 @@ class PanelWidget:
         for name, label in self.errors.items():
             label.setText(LEVEL_SIGNS[Level.BAD] + self.model.errors[name] if name in self.model.errors else "")
             label.setVisible(name in self.model.errors)
+        self.sounds.show(sounds_are_on())
         self.refresh_live()
 
     def tick(self) -> None:
@@ -251,6 +253,11 @@ class PanelWidget:
         row.addWidget(self._progress, 1)
         row.addWidget(cancel)
         self._layout.addWidget(self._progress_row)
+        (info,) = SoundParameters.describe()
+        self.sounds = Editor(info, lambda on: sound_parameters().change(sounds=on))
+        self.sounds.input.setProperty("text", "Sounds")
+        self.sounds.widget.setObjectName(info.name)
+        self._layout.addWidget(self.sounds.widget)
         self._layout.addStretch(1)
 
     def _browse(self, item: FileField) -> None:

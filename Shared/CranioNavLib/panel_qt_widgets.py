@@ -56,7 +56,7 @@ class Ticker:
     """Calls a function again and again from the event loop: how samples of a device's thread reach the scene."""
 
     def __init__(self, parent: Any, interval_ms: int, work: Callable[[], object]) -> None:
-        self._work, self._timer = work, toolkit().QTimer(parent)
+        self._work, self._timer = work, toolkit().QTimer() if parent is None else toolkit().QTimer(parent)
         self._timer.setInterval(interval_ms)
         connect(self._timer, "timeout()", self._tick)
 

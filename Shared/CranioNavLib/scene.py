@@ -72,6 +72,7 @@ ROLES: dict[str, Role] = {
         Role("RegistrationSession", _SCRIPT, (REGISTRATION,)),
         Role("RegisteredPoints", _POINTS, (REGISTRATION,), color=GREEN),
         Role("Results", "Table", (REGISTRATION,)),
+        Role("Sounds", _SCRIPT, (TRACKING, ULTRASOUND, REGISTRATION)),
         Role("TargetErrors", "Table", (REGISTRATION,)),
         Role("Residuals", "Table", (REGISTRATION,)),
         Role("ResidualsSeries", "PlotSeries", (REGISTRATION,)),

@@ -1,62 +1,18 @@
-"""What is heard: one cue for what has happened since the last look, the gravest first."""
+"""What the page's own instrument plays, calculated by a browser; when it plays is tested with CranioNavLib.sounds."""
 
 from __future__ import annotations
 
 import itertools
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from ModuleUltrasoundLib.palpation.guidance import cue
 
 from Testing.Python import workstation_user as user_module
-from Workstation.web.sounds import Cues, Situation, TiltTone
 from Workstation.web.sounds_view import PLAY
 
 needs_browser = pytest.mark.skipif(not Path(user_module.BROWSER).exists(), reason="no Chromium on this machine")
-
-
-def heard(*moments: Situation) -> list[str]:
-    cues = Cues()
-    return [cue["name"] if (cue := cues.next(moment)) else "" for moment in moments]
-
-
-def test_a_point_more_is_heard_and_a_loaded_list_is_not():
-    assert heard(Situation(3), Situation(4), Situation(4), Situation(9), Situation(8)) == ["", "taken", "", "", ""]
-
-
-def test_a_tool_that_leaves_is_heard_above_all():
-    both = frozenset({"Stylus", "Probe"})
-    assert heard(Situation(1, (), both), Situation(2, ("no",), frozenset({"Stylus"})))[-1] == "lost"
-    assert heard(Situation(tools=frozenset()), Situation(tools=both))[-1] == ""
-
-
-def test_the_same_refusal_is_heard_once_and_a_second_of_the_same_words_again():
-    first, second = ["no"], ["no"]
-    moments = [Situation(), Situation(refusals=(first,)), Situation(refusals=(first,)), Situation(refusals=(second,))]
-    assert heard(*moments) == ["", "refused", "", "refused"]
-
-
-def test_each_cue_has_a_number_of_its_own():
-    cues = Cues()
-    numbers = [cues.next(Situation(taken)) for taken in range(4)][1:]
-    assert [one["count"] for one in numbers] == [1, 2, 3]
-
-
-def guide_at(angle_deg: float, on_target: bool = True) -> SimpleNamespace:
-    return SimpleNamespace(cue=cue(angle_deg), on_target=on_target)
-
-
-def test_the_tilts_tone_is_the_guides_own_and_falls_silent_off_the_point():
-    tone = TiltTone()
-    told = [tone.next(guide_at(angle)) for angle in (15.0, 15.0, 5.0, 1.0)]
-    assert [one["count"] for one in told] == [1, 2, 3, 4], "the page hears that the tilt is still known"
-    assert told[0]["rate"] < told[2]["rate"]
-    assert told[0]["pitch"] < told[2]["pitch"] < told[3]["pitch"]
-    assert told[3]["rate"] == 0.0, "square: a steady tone"
-    silent = {"rate": 0.0, "pitch": 0.0, "count": 0}
-    assert tone.next(guide_at(1.0, on_target=False)) == tone.next(None) == silent
 
 
 RATE_HZ = 16000  # Hz, of the sound that is calculated

@@ -15,6 +15,7 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.panel import Panel
 from CranioNavLib.panel_model import PanelModel
 from CranioNavLib.sequence_metafile import put_aside
+from CranioNavLib.sounds import Cues, TiltTone, situation
 from trame.app import TrameApp
 from trame_slicer.app.logic import get_view_trame_id
 
@@ -32,7 +33,6 @@ from Workstation.web.session_panel import SessionLogic
 from Workstation.web.session_resume_view import Resuming
 from Workstation.web.session_windows import Windows
 from Workstation.web.sharpness import Sharpness, resize_slice
-from Workstation.web.sounds import Cues, TiltTone, situation
 from Workstation.web.tool_models import registered
 from Workstation.web.view_controls import ViewControls, layout_grid
 from Workstation.web.view_frame import SliceSliders
@@ -274,7 +274,7 @@ class WorkstationApp(TrameApp):
         """Views, legend and sounds as the open step needs them."""
         ultrasound = self.logics[ULTRASOUND]
         state.legend = self.views.refresh(state.step, state.error_shown, self._forerun_mm(), self._asked_for(state.step))
-        cue = self.cues.next(situation(self.panels, ultrasound))
+        cue = self.cues.next(situation([view.model for view in self.panels.values()], len(ultrasound.taken())))
         if cue is not None:
             state.cue = cue
         state.tilt = self.tilt.next(ultrasound.guide() if state.step == "ultrasound" else None)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
+import json
+
+from CranioNavLib.sounds import NEWS_S
+from CranioNavLib.tones import BEEP_S, CUES, RAMP_S, TILT_PEAK
 from trame.widgets import client, html
 
-# Each cue: waveform, peak, and [frequency in Hz, start in s, length in s] of each tone. Small loudspeakers play little below
-# 250 Hz, so that the low ones have overtones; peaks by what the ear makes of them. Two at once with the tilt stay unclipped.
-# `instrument` plays into any audio context, also into one that only calculates.
+# `instrument` plays into any audio context, also into one that only calculates. Each of CUES: waveform, peak, tones.
 PLAY = """
 (() => {
   if (window.cranionavSounds) return;  // another layout draws the page anew, and with it this script
-  const CUES = {
-    taken: ['sine', 0.25, [[880, 0, 0.09], [1320, 0.1, 0.14]]],
-    refused: ['sawtooth', 0.4, [[311, 0, 0.18], [233, 0.2, 0.28]]],
-    lost: ['triangle', 0.4, [[660, 0, 0.12], [520, 0.15, 0.12], [390, 0.3, 0.25]]],
-  };
-  const TILT = 0.1, BEEP_S = 0.05, RAMP_S = 0.01, AHEAD_S = 0.15, NEWS_MS = 1000;
+  const CUES = $CUES$, TILT = $TILT$, BEEP_S = $BEEP_S$, RAMP_S = $RAMP_S$, NEWS_MS = $NEWS_MS$, AHEAD_S = 0.15;
   const instrument = (context) => {
     const out = context.createGain();
     out.connect(context.destination);
@@ -101,6 +98,14 @@ PLAY = """
   }, 50);
 })();
 """
+for _name, _value in {
+    "CUES": {name: [cue.form, cue.peak, cue.tones] for name, cue in CUES.items()},
+    "TILT": TILT_PEAK,
+    "BEEP_S": BEEP_S,
+    "RAMP_S": RAMP_S,
+    "NEWS_MS": 1000 * NEWS_S,
+}.items():
+    PLAY = PLAY.replace(f"${_name}$", json.dumps(_value))
 
 
 def draw_sounds() -> None:

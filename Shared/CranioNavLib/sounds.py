@@ -1,15 +1,38 @@
-"""When the page is to be heard: a point taken, a refusal, a tool lost, the probe coming upright. The browser makes the tones."""
+"""When the user is to hear something: a point taken, a refusal, a tool lost, the probe coming upright. Others make the tones."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from CranioNavLib import scene, scene_data
 from CranioNavLib.panel import Level
+from CranioNavLib.panel_model import PanelModel
+from CranioNavLib.parameter_node import ParameterNode
+from CranioNavLib.parameters import Parameters
 
 TOUCHED = ("LandmarksPatient", "TargetsPatient", "PlausibilityPoints", "ClampPins")
 TOOLS = ("Stylus", "Probe", "Sphere")
+NEWS_S = 1.0  # a tilt that was not heard of for so long is not known any more
+
+
+@dataclass(frozen=True)
+class SoundParameters(Parameters):
+    """What the scene keeps of sounds, for the panels of all modules in 3D Slicer; each window of the web page has its own."""
+
+    sounds: Annotated[bool, "a point taken, a refusal and a lost tool are heard, and how far the probe is tilted"] = True
+
+
+def sound_parameters() -> ParameterNode[SoundParameters]:
+    """The door to them; makes their node."""
+    return ParameterNode(scene.find_or_create("Sounds"), SoundParameters)
+
+
+def sounds_are_on() -> bool:
+    """Whether anything is to be heard; asked for many times a second, so no node is made."""
+    node = scene.find("Sounds")
+    return node is None or ParameterNode(node, SoundParameters).read().sounds
 
 
 @dataclass(frozen=True)
@@ -51,18 +74,23 @@ class TiltTone:
 
     def __init__(self) -> None:
         self._count = 0
+        self._before: Any = None
 
     def next(self, guide: Any) -> dict[str, Any]:
-        """Beeps a second (0: a steady tone), pitch in Hz (0: silence), and a running number, without which the page is silent."""
-        self._count += 1
+        """Beeps a second (0: a steady tone), pitch in Hz (0: silence), and a number that is another one with each new guide.
+
+        Who plays falls silent when the number stays the same for `NEWS_S`: lines have stopped, and the tilt is not known.
+        """
+        if guide is not self._before:
+            self._before, self._count = guide, self._count + 1
         if guide is None or not guide.on_target:
             return {"rate": 0.0, "pitch": 0.0, "count": 0}
         return {"rate": round(guide.cue.rate_hz, 2), "pitch": round(guide.cue.pitch_hz), "count": self._count}
 
 
-def situation(panels: dict[str, Any], ultrasound: Any) -> Situation:
-    """The present moment."""
+def situation(models: Iterable[PanelModel], palpated: int) -> Situation:
+    """The present moment: of the scene, of what the panels say, and of the points palpated in this recording."""
     counts = [node.GetNumberOfControlPoints() for node in map(scene.find, TOUCHED) if node is not None]
-    refusals = tuple(panel.model.message for panel in panels.values() if panel.model.message.level is Level.BAD)
+    refusals = tuple(model.message for model in models if model.message.level is Level.BAD)
     tools = frozenset(tool for tool in TOOLS if scene_data.get_pose(f"{tool}ToReference").matrix is not None)
-    return Situation(sum(counts) + len(ultrasound.taken()), refusals, tools)
+    return Situation(sum(counts) + palpated, refusals, tools)
