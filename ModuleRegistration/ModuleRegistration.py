@@ -18,10 +18,11 @@ from CranioNavLib.host import (  # noqa: E402
     ScriptedLoadableModuleWidget,
 )
 from CranioNavLib.module_logic import describeModule  # noqa: E402
-from CranioNavLib.module_widget import PanelOfModule  # noqa: E402
+from CranioNavLib.module_widget import PolledPanel  # noqa: E402
 from ModuleRegistrationLib.logic.bone import BoneStep  # noqa: E402
 from ModuleRegistrationLib.logic.loading import LoadingStep  # noqa: E402
 from ModuleRegistrationLib.logic.planning import PlanningStep  # noqa: E402
+from ModuleRegistrationLib.logic.refining import POLL_MS, RefiningStep  # noqa: E402
 from ModuleRegistrationLib.logic.verifying import VerifyingSteps  # noqa: E402
 from ModuleRegistrationLib.panel_description import PANEL  # noqa: E402
 from ModuleRegistrationLib.selftest import RegistrationSelfTest  # noqa: E402
@@ -35,18 +36,22 @@ class ModuleRegistration(ScriptedLoadableModule):
         describeModule(self.parent, "CranioNav Registration", PANEL, ["ModuleTracking", "ModuleUltrasound"])
 
 
-class ModuleRegistrationWidget(PanelOfModule, ScriptedLoadableModuleWidget):
-    """The panel inside 3D Slicer."""
+class ModuleRegistrationWidget(PolledPanel, ScriptedLoadableModuleWidget):
+    """The panel inside 3D Slicer. Guidance is refined while another module is shown, too."""
 
     panelDescription = PANEL
+    pollMs = POLL_MS
 
     def createLogic(self):
         """The module's logic."""
         return ModuleRegistrationLogic()
 
 
-class ModuleRegistrationLogic(LoadingStep, BoneStep, PlanningStep, VerifyingSteps, ScriptedLoadableModuleLogic):
-    """Nodes in, arrays to the library, results to nodes: the steps of the panel together. Runs without a widget."""
+class ModuleRegistrationLogic(LoadingStep, BoneStep, PlanningStep, VerifyingSteps, RefiningStep, ScriptedLoadableModuleLogic):
+    """Nodes in, arrays to the library, results to nodes: the steps of the panel together. Runs without a widget.
+
+    While points are palpated, the owner of the event loop calls `poll`.
+    """
 
 
 class ModuleRegistrationTest(RegistrationSelfTest, ScriptedLoadableModuleTest):

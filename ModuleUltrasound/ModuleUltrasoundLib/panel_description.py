@@ -125,6 +125,7 @@ PANEL = Panel(
                 Picture(
                     "pointsDrawn", "The points of the protocol: full ones are taken, the thick ring is asked for", on_page=False
                 ),
+                ReadOut("restsOn", "Guidance rests on"),
                 ReadOut("brings", "Predicted error with this point", "mm"),
                 ReadOut("tilt", "Tilt off the upright", "°", large=True),
                 ReadOut("dwell", "Taken"),

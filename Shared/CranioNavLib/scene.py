@@ -67,6 +67,7 @@ ROLES: dict[str, Role] = {
         Role("ALineSequence", "Sequence", (ULTRASOUND,)),
         Role("Protocol", _SCRIPT, (ULTRASOUND,)),
         Role("ProtocolPoints", _POINTS, (ULTRASOUND,), color=BLUE),
+        Role("Guidance", _SCRIPT, (REGISTRATION,)),
         Role("TrackingSession", _SCRIPT, (TRACKING,)),
         Role("UltrasoundSession", _SCRIPT, (ULTRASOUND,)),
         Role("RegistrationSession", _SCRIPT, (REGISTRATION,)),

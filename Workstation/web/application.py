@@ -189,7 +189,7 @@ class WorkstationApp(TrameApp):
         """Take over what the devices have to say. Not drawn while a tool's place in the CT is not known."""
         self._polled_s = time.monotonic()
         self.painter.muted = not registered()
-        for name in (TRACKING, ULTRASOUND, HAND):
+        for name in (TRACKING, ULTRASOUND, REGISTRATION, HAND):
             moving = self.painter.while_moving() if name == TRACKING else contextlib.nullcontext()
             with moving, contextlib.suppress(InputError):  # the logic keeps the reason and its panel shows it
                 self.logics[name].poll()

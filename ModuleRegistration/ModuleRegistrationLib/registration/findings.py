@@ -112,12 +112,12 @@ def find_large_offset(problem: RegistrationProblem, result: RegistrationResult) 
     return [Finding(WARNING, text)]
 
 
-def find_few_points(result: RegistrationResult) -> list[Finding]:
+def find_few_points(result: RegistrationResult, least: int = LEAST_CHECKED) -> list[Finding]:
     """Whether so few points were used that a wrong pose would fit them as well as the right one."""
     count = int(result.used.sum())
-    if count >= LEAST_CHECKED:
+    if count >= least:
         return []
-    text = f"only {count} points are used, too few to show an error among them; palpate {LEAST_CHECKED - count} more"
+    text = f"only {count} points are used, too few to show an error among them; palpate {least - count} more"
     return [Finding(WARNING, text)]
 
 

@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Any, Optional
 import numpy as np
 import numpy.typing as npt
 from CranioNavLib import scene_data
-from CranioNavLib.panel import Reading
+from CranioNavLib.panel import Level, Reading
+from CranioNavLib.rigid import Array
+from CranioNavLib.scene_guidance import GuidanceRegistration, get_guidance
 
 from ModuleUltrasoundLib.live_drawings import PointState, draw_points
-from ModuleUltrasoundLib.logic.planning import count_of, in_the_way, registered
+from ModuleUltrasoundLib.logic.planning import count_of, in_the_way
 from ModuleUltrasoundLib.logic.probing import ProbeStep
 from ModuleUltrasoundLib.panel_description import TOWARDS_TABLE
 
@@ -55,9 +57,7 @@ class AskStep(ProbeStep):
         candidates = within if within.any() else candidates
         if not candidates.any():
             return
-        registered_with = scene_data.get_points("RegisteredPoints").labels if count_of("RegisteredPoints") else ()
-        since = [point.target for point in palpation.taken if point.label not in registered_with]
-        self._brings = self._best(plan, candidates, since)
+        self._brings = self._best(plan, candidates)
         if self._brings is not None:
             self.goTo(self._brings.index)
             return
@@ -78,6 +78,26 @@ class AskStep(ProbeStep):
         if best is None or palpation is None or best.index != self.currentIndex() or not any(palpation.open_points):
             return None
         return Reading(f"{best.tre_now_mm:.1f} → {best.tre_then_mm:.1f}")
+
+    def weighAnew(self) -> None:
+        """Guidance rests on something else now: the point asked for stays, what it is expected to bring is told anew."""
+        index = self.currentIndex()
+        if self.palpation is not None and index >= 0 and self.palpation.open_points[index]:
+            plan = self._plan()
+            self._brings = self._best(plan, np.arange(len(plan)) == index)
+
+    def restsOn(self) -> Optional[Reading]:
+        """What guidance rests on, its error at the targets, and why the points taken last have not made it better."""
+        from ModuleUltrasoundLib.palpation.next_point import rms_tre_mm
+
+        rests = get_guidance()
+        if rests is None:
+            return None
+        count = len(rests.points)
+        said = f"landmarks and {count} points" if count else "landmarks"
+        if rests.error is not None and (count_of("TargetsCT") or count_of("ProtocolPoints")):
+            said += f"; error to expect {float(rms_tre_mm(*rests.error[:2], _targets())):.1f} mm (RMS at the targets)"
+        return Reading("; ".join(filter(None, [said, rests.remark])), Level.WARNING if rests.remark else Level.PLAIN)
 
     def pointStates(self) -> list[PointState]:
         """How far each planned point is; none once they are palpated and measured."""
@@ -112,17 +132,26 @@ class AskStep(ProbeStep):
         distance = ReachSettings(clamp_clearance_mm=wanted.clamp_clearance_mm)
         return reachable(plan, in_the_way(), TOWARDS_TABLE[wanted.patient_lies], distance)
 
-    def _best(self, plan: ProtocolPoints, candidates: npt.NDArray[np.bool_], since: list[int]) -> Optional[NextTarget]:
-        """By the error of the registration in force, with the points taken since it counted in; None where it is not known."""
+    def _best(self, plan: ProtocolPoints, candidates: npt.NDArray[np.bool_]) -> Optional[NextTarget]:
+        """By the error of what guidance rests on, with the points taken since counted in; None where it is not known."""
         from ModuleUltrasoundLib.palpation.next_point import DEFAULTS, choose_next, covariance_with
 
-        error = scene_data.get_motion_error() if registered() else None
-        if error is None:
+        rests = get_guidance()
+        if rests is None or rests.error is None:
             return None
-        covariance, pivot, _ = error
-        for index in since:
+        covariance, pivot, _ = rests.error
+        for index in self._takenSince(rests):
             covariance = covariance_with(
                 covariance, plan.positions_ras_mm[index], plan.normals[index], pivot, DEFAULTS.point_sd_mm
             )
-        targets = scene_data.get_points("TargetsCT").positions_mm if count_of("TargetsCT") else plan.positions_ras_mm
-        return choose_next(plan, candidates, covariance, pivot, targets)
+        return choose_next(plan, candidates, covariance, pivot, _targets())
+
+    def _takenSince(self, rests: GuidanceRegistration) -> list[int]:
+        """Points that are taken and that guidance does not rest on yet."""
+        taken = self.palpation.taken if self.palpation is not None else ()
+        return [point.target for point in taken if point.label not in rests.points]
+
+
+def _targets() -> Array:
+    """(T, 3) RAS: where the error matters, as far as it is told while points are palpated."""
+    return scene_data.get_points("TargetsCT" if count_of("TargetsCT") else "ProtocolPoints").positions_mm

@@ -11,11 +11,12 @@ from CranioNavLib import scene, scene_data
 from CranioNavLib.module_logic import done_or
 from CranioNavLib.panel import Level, Reading, StepState, StepStatus, Task
 from CranioNavLib.rigid import Array, invert_rigid, transform_points
+from CranioNavLib.scene_guidance import get_guidance
 from CranioNavLib.sequence_metafile import put_aside
 
 from ModuleUltrasoundLib.devices.line_stream import PosedLine
 from ModuleUltrasoundLib.logic.measuring import MeasureStep
-from ModuleUltrasoundLib.logic.planning import count_of, registered
+from ModuleUltrasoundLib.logic.planning import count_of
 from ModuleUltrasoundLib.logic.sweeping import SweepStep
 from ModuleUltrasoundLib.panel_description import PalpateBy
 
@@ -34,20 +35,35 @@ class PalpationStep(SweepStep, MeasureStep):
         super().__init__(parent)
         self.recorder: Optional[LineRecorder] = None
         self._palpated: Optional[PalpationStatus] = None  # its last status
+        self._guidedBy = b""  # the registration that the last lines were taken under
         self._rests: Optional[tuple[int, Array]] = None  # the point just taken, and where the probe stood then (Reference)
         self._restsUntil = np.inf  # it was taken back: from then on the probe is where it is asked to be
 
     def goTo(self, index: int) -> None:
         """Ask for a point; where it is expected on the patient follows from the registration, once there is one."""
         super().goTo(index)
-        points = scene.find("ProtocolPoints")
-        if self.palpation is None or index < 0 or points is None:
+        if self.palpation is not None and index >= 0 and scene.find("ProtocolPoints") is not None:
+            self.palpation.aim(index, self._expectedAt(index), self._changes[-1][0])
+
+    def _expectedAt(self, index: int) -> Optional[Array]:
+        """(3,) Reference; None without a registration."""
+        rests = get_guidance()
+        if rests is None:
+            return None
+        target = np.array(scene.find_or_create("ProtocolPoints").GetNthControlPointPosition(index))[None]
+        expected: Array = transform_points(invert_rigid(rests.reference_to_ras), target)[0]
+        return expected
+
+    def _followGuidance(self) -> None:
+        """Where guidance rests on another registration than at the last lines, the point asked for is expected elsewhere."""
+        rests, index = get_guidance(), self.currentIndex()
+        now = rests.reference_to_ras.tobytes() if rests is not None else b""
+        if now == self._guidedBy:
             return
-        expected = None
-        if registered():
-            target = np.array(points.GetNthControlPointPosition(index))[None]
-            expected = transform_points(invert_rigid(scene_data.get_transform("ReferenceToRas")), target)[0]
-        self.palpation.aim(index, expected, self._changes[-1][0])
+        self._guidedBy = now
+        if self.palpation is not None and self.palpation.target == index:
+            self.palpation.expect(self._expectedAt(index))
+            self.weighAnew()
 
     def disconnect(self) -> None:
         """Let go of the device; a recording under way is finished."""
@@ -123,6 +139,7 @@ class PalpationStep(SweepStep, MeasureStep):
             self.sweepOver(lines)
         if self.palpation is None:
             return
+        self._followGuidance()
         new = False
         for line in lines:
             self._palpated = self.palpation.add(line)

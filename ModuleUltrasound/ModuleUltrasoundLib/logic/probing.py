@@ -10,13 +10,14 @@ from CranioNavLib import scene, scene_data
 from CranioNavLib.errors import InputError
 from CranioNavLib.panel import Level, Reading, StepStatus
 from CranioNavLib.rigid import Array
+from CranioNavLib.scene_guidance import get_guidance
 
 from ModuleUltrasoundLib.devices.device import AModeDevice
 from ModuleUltrasoundLib.devices.line_batches import LineBatch, LineBatches
 from ModuleUltrasoundLib.devices.line_stream import LinePoser, LineStream, PosedLine
 from ModuleUltrasoundLib.devices.linked_device import LinkedDevice
 from ModuleUltrasoundLib.live_drawings import a_line, bulls_eye, draw_a_line, draw_bulls_eye
-from ModuleUltrasoundLib.logic.planning import ProtocolStep, registered
+from ModuleUltrasoundLib.logic.planning import ProtocolStep
 
 if TYPE_CHECKING:
     from CranioNavLib.surface import Surface
@@ -121,19 +122,18 @@ class ProbeStep(ProtocolStep):
             self._gain_db = gain_db
 
     def steer(self) -> None:
-        """Where the probe stands to the bone it has to see, under the registration in force."""
+        """Where the probe stands to the bone it has to see, under the registration that guidance rests on."""
         from ModuleUltrasoundLib.palpation.guidance import guide
 
-        pose, table = scene_data.get_pose("ProbeToReference"), scene.find("OuterTable")
+        pose, table, rests = scene_data.get_pose("ProbeToReference"), scene.find("OuterTable"), get_guidance()
         self._guide = None
-        if pose.matrix is None or not registered() or table is None:
+        if pose.matrix is None or rests is None or table is None:
             return
-        probe_to_ras, surface = scene_data.get_transform("ReferenceToRas") @ pose.matrix, self._surfaceOf(table)
+        probe_to_ras, surface = rests.reference_to_ras @ pose.matrix, self._surfaceOf(table)
         aim = self.aimAt(probe_to_ras, surface)
         if aim is None:
             return
-        error = scene_data.get_motion_error()
-        self._guide = guide(probe_to_ras, surface, *aim, None if error is None else error[0][:3, :3])
+        self._guide = guide(probe_to_ras, surface, *aim, None if rests.error is None else rests.error[0][:3, :3])
 
     def aimAt(self, probe_to_ras: Array, surface: Surface) -> Optional[tuple[Array, Array]]:
         """Where the beam has to meet the bone, and its outward normal there (RAS); None without a point that is asked for."""

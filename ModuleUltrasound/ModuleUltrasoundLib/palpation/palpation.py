@@ -156,6 +156,10 @@ class Palpation:
         self._target, self._asked_s = target, asked_s
         self._target_mm = None if position_mm is None else np.asarray(position_mm, dtype=float)
 
+    def expect(self, position_mm: Optional[Array]) -> None:
+        """The same point is expected elsewhere, (3,) in Reference, as the registration has become better; a dwell goes on."""
+        self._target_mm = None if position_mm is None else np.asarray(position_mm, dtype=float)
+
     def undo(self) -> Optional[TakenPoint]:
         """Take back the last point and return to it; None if there is none."""
         if not self._taken:
