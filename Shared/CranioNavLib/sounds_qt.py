@@ -15,7 +15,7 @@ from CranioNavLib import host
 from CranioNavLib.panel_model import PanelModel
 from CranioNavLib.panel_qt_widgets import Ticker, toolkit
 from CranioNavLib.sounds import NEWS_S, Cues, TiltTone, situation, sounds_are_on
-from CranioNavLib.tones import CUES, STEADY_S, beep_samples, cue_samples, steady_samples, write_wave
+from CranioNavLib.tones import CROSSING_S, CUES, PIECE_S, beep_samples, cue_samples, steady_samples, write_wave
 
 LOG = logging.getLogger(__name__)
 TICK_MS = 25  # the quickest beeps of the tilt come every 83 ms
@@ -72,8 +72,11 @@ class SoundEffects:
         self._folder = tempfile.TemporaryDirectory(prefix="cranionav-sounds-")  # removed when the process ends
         self._cues = {name: self._effect(name, cue_samples(name)) for name in CUES}
         self._beeps = [self._effect(f"beep-{round(pitch)}", beep_samples(pitch)) for pitch in PITCHES_HZ]
-        self._steady = self._effect("steady", steady_samples(STEADY_HZ))
-        self._next_s = 0.0  # when the next beep is due
+        self._pieces = [
+            self._effect(f"steady-{turn}", steady_samples(STEADY_HZ)) for turn in (0, 1)
+        ]  # of the steady tone, by turns
+        self._next_s = 0.0  # when the next beep, or piece, is due
+        self._steady = False
 
     def cue(self, name: str) -> None:
         """Play one of CUES."""
@@ -83,23 +86,28 @@ class SoundEffects:
         effect.play()
 
     def tilt(self, rate_hz: float, pitch_hz: float, now_s: float) -> None:
-        """Beep when it is time to; the steady tone ends by itself when this is not called any more."""
-        if pitch_hz and not rate_hz:
-            self._next_s = 0.0
-            self._steady.setLoopCount(math.ceil(NEWS_S / STEADY_S))  # counts anew while it plays
-            if not self._steady.isPlaying():
-                self._steady.play()
-            return
-        if self._steady.isPlaying():
-            self._steady.stop()
+        """Beep when it is time to; the steady tone is played by pieces, so that it ends when this is not called any more."""
+        steady = bool(pitch_hz) and not rate_hz
+        if steady != self._steady or not pitch_hz:
+            self._hush()
+        self._steady = steady
         if not pitch_hz:
-            self._next_s = 0.0
             return
-        self._next_s = min(self._next_s, now_s + 1 / rate_hz)
-        if now_s >= self._next_s:
-            self._beeps[_nearest(pitch_hz)].play()
-            due_s = self._next_s + 1 / rate_hz  # keeps the rhythm where ticks come late
-            self._next_s = due_s if due_s > now_s else now_s + 1 / rate_hz
+        period_s = PIECE_S - CROSSING_S if steady else 1 / rate_hz
+        self._next_s = min(self._next_s, now_s + period_s)
+        if now_s < self._next_s:
+            return
+        (self._pieces[0] if steady else self._beeps[_nearest(pitch_hz)]).play()
+        self._pieces.reverse()
+        due_s = self._next_s + period_s  # keeps the rhythm where ticks come late
+        self._next_s = due_s if due_s > now_s else now_s + period_s
+
+    def _hush(self) -> None:
+        """Silence now; what comes next begins at once."""
+        self._next_s = 0.0
+        for piece in self._pieces:
+            if piece.isPlaying():
+                piece.stop()
 
     def _effect(self, name: str, samples: Any) -> Any:
         path = Path(self._folder.name) / f"{name}.wav"
@@ -159,12 +167,13 @@ class PanelSounds:
         self._ticker.start()
 
     def leave(self, source: Source) -> None:
-        """Listen to it no more; the last one ends it all."""
+        """Listen to it no more; the last one ends it all, for sounds must not outlive the application."""
         if source in self._sources:
             self._sources.remove(source)
         if not self._sources and self._ticker is not None:
             self._ticker.stop()
             self._play(lambda instrument: instrument.tilt(0.0, 0.0, self._clock()))
+            self._ticker = self.instrument = None
 
     def listen(self) -> None:
         """What the timer does."""

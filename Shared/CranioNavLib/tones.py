@@ -14,7 +14,8 @@ RATE_HZ = 44100
 RAMP_S = 0.01  # a tone swells and fades for so long, or it would click
 BEEP_S = 0.05  # of the tilt
 TILT_PEAK = 0.1
-STEADY_S = 0.1  # of a piece of the steady tone, which is played again and again: whole periods of every 10 Hz
+PIECE_S, CROSSING_S = 1.0, 0.1  # of the steady tone where it is played in pieces: its length, and how long two sound at once
+REST_S = 0.06  # of silence behind: Qt may keep the last 20 ms of a sound back, and play them before the next
 
 
 @dataclass(frozen=True)
@@ -40,10 +41,10 @@ FORMS = {
 }
 
 
-def tone(form: str, hertz: float, peak: float, length_s: float) -> Array:
+def tone(form: str, hertz: float, peak: float, length_s: float, ramp_s: float = RAMP_S) -> Array:
     """(N,) one tone that swells and fades."""
     times = np.arange(round(length_s * RATE_HZ)) / RATE_HZ
-    loudness = np.clip(np.minimum(times, length_s - times) / RAMP_S, 0.0, 1.0)
+    loudness = np.clip(np.minimum(times, length_s - times) / ramp_s, 0.0, 1.0)
     samples: Array = peak * loudness * np.asarray(FORMS[form](hertz * times), dtype=float)
     return samples
 
@@ -65,14 +66,13 @@ def beep_samples(pitch_hz: float) -> Array:
 
 
 def steady_samples(pitch_hz: float) -> Array:
-    """(N,) a piece of the steady tone that can be played end to end; its pitch is a whole number of periods in it."""
-    turns = round(pitch_hz * STEADY_S)
-    samples: Array = TILT_PEAK * np.sin(2 * np.pi * turns * np.arange(round(STEADY_S * RATE_HZ)) / round(STEADY_S * RATE_HZ))
-    return samples
+    """(N,) a piece of the steady tone; the next swells while it fades."""
+    return tone("sine", pitch_hz, TILT_PEAK, PIECE_S, CROSSING_S)
 
 
 def write_wave(path: Path, samples: Array) -> None:
-    """Write samples (1: full scale) as a WAV file: 16 bit, one channel, which every Qt plays."""
+    """Write samples (1: full scale), and silence, as a WAV file: 16 bit, one channel, which every Qt plays."""
+    samples = np.concatenate([samples, np.zeros(round(REST_S * RATE_HZ))])
     with wave.open(str(path), "wb") as file:
         file.setnchannels(1)
         file.setsampwidth(2)

@@ -17,7 +17,7 @@ from CranioNavLib.panel import Level
 from CranioNavLib.slicer_files import LabelledPoints
 from CranioNavLib.sounds import NEWS_S, sound_parameters, sounds_are_on
 from CranioNavLib.sounds_qt import PITCHES_HZ, TICK_MS, Beeper, PanelSounds, SoundEffects, Source, best_instrument
-from CranioNavLib.tones import CUES, STEADY_S
+from CranioNavLib.tones import CROSSING_S, CUES, PIECE_S
 from ModuleUltrasoundLib.palpation.guidance import cue
 
 
@@ -27,14 +27,11 @@ class StandInEffect:
     made, loads, fails = [], True, False
 
     def __init__(self):
-        self.plays, self.playing, self.loops = 0, False, 1
+        self.plays, self.playing = 0, False
         StandInEffect.made.append(self)
 
     def setSource(self, url):
         self.name = url.fileName().partition(".")[0]
-
-    def setLoopCount(self, count):
-        self.loops = count
 
     def isLoaded(self):
         return StandInEffect.loads
@@ -65,6 +62,11 @@ def qt():
 def played():
     """How often each sound was played."""
     return {effect.name: effect.plays for effect in StandInEffect.made if effect.plays}
+
+
+def steady_sounds():
+    """Whether a piece of the steady tone is being played."""
+    return any(effect.playing for effect in StandInEffect.made if effect.name.startswith("steady"))
 
 
 # The instrument
@@ -99,13 +101,18 @@ def test_beeps_quicken_at_once_and_a_late_tick_brings_no_crowd():
 
 def test_the_steady_tone_goes_on_while_it_is_told_and_would_end_by_itself():
     instrument = SoundEffects(StandInEffect)
-    for tick in range(20):
+    for tick in range(200):
         instrument.tilt(0.0, 880.0, 100.0 + 0.025 * tick)
-    steady = next(effect for effect in StandInEffect.made if effect.name == "steady")
-    assert steady.plays == 1
-    assert steady.loops * STEADY_S == pytest.approx(NEWS_S), "a window that hangs falls silent"
-    instrument.tilt(0.0, 0.0, 101.0)
-    assert not steady.playing
+    assert played() == {"steady-0": 3, "steady-1": 3}, "by turns, one every 0.9 s of 5 s"
+    assert PIECE_S <= NEWS_S, "a window that hangs falls silent"
+    assert CROSSING_S > 2 * TICK_MS / 1000
+    instrument.tilt(0.0, 0.0, 105.0)
+    assert not steady_sounds()
+    instrument.tilt(6.0, 500.0, 105.1)
+    instrument.tilt(0.0, 880.0, 105.2)
+    assert steady_sounds()
+    instrument.tilt(6.0, 500.0, 105.3)
+    assert not steady_sounds()
 
 
 def test_where_qt_has_no_sounds_one_line_says_so_and_cues_beep(monkeypatch, caplog):
@@ -210,12 +217,11 @@ def test_the_tilt_is_heard_while_it_is_known(listening):
 def test_switched_off_nothing_is_heard_and_what_was_missed_is_not_made_up_for(listening):
     listening.guide = guide_at(0.5)
     listening.go(0.2)
-    steady = next(effect for effect in StandInEffect.made if effect.name == "steady")
-    assert steady.playing
+    assert steady_sounds()
     sound_parameters().change(sounds=False)
     listening.palpated = 1
     listening.go(0.3)
-    assert not steady.playing
+    assert not steady_sounds()
     sound_parameters().change(sounds=True)
     listening.go(0.3)
     assert "taken" not in played()
@@ -250,8 +256,11 @@ def test_a_panel_that_is_closed_is_heard_no_more(listening):
     listening.go(0.2)
     for source in listening.sources:
         listening.sounds.leave(source)
-    assert not any(effect.playing for effect in StandInEffect.made if effect.name == "steady")
-    assert not listening.sounds._ticker._timer.isActive()
+    assert not steady_sounds()
+    assert listening.sounds.instrument is None, "sounds must not outlive the application"
+    listening.sounds.join(listening.sources[0])
+    listening.go(0.2)
+    assert isinstance(listening.sounds.instrument, SoundEffects)
 
 
 # The modules' widgets

@@ -8,9 +8,10 @@ import wave
 import numpy as np
 import pytest
 from CranioNavLib.tones import (
+    CROSSING_S,
     CUES,
+    PIECE_S,
     RATE_HZ,
-    STEADY_S,
     TILT_PEAK,
     beep_samples,
     cue_samples,
@@ -48,11 +49,16 @@ def test_two_cues_at_once_with_the_tilt_are_not_clipped():
         assert CUES[first].peak + CUES[second].peak + TILT_PEAK < 1.0
 
 
-def test_the_steady_tone_is_played_end_to_end_without_a_step():
-    twice = np.tile(steady_samples(880.0), 2)
-    assert np.abs(np.diff(twice)).max() < 1.01 * TILT_PEAK * 2 * np.pi * 880 / RATE_HZ
-    assert len(twice) == 2 * round(STEADY_S * RATE_HZ)
-    assert strongest_hz(twice) == pytest.approx(880.0, abs=1.0)
+def test_pieces_of_the_steady_tone_make_one_tone():
+    piece, every = steady_samples(880.0), round((PIECE_S - CROSSING_S) * RATE_HZ)
+    played = np.zeros(3 * every + len(piece))
+    for number in range(4):
+        played[number * every : number * every + len(piece)] += piece
+    inside = np.abs(played[round(CROSSING_S * RATE_HZ) : -round(CROSSING_S * RATE_HZ)])
+    loudest = inside[: len(inside) // 441 * 441].reshape(-1, 441).max(axis=1)  # of each 10 ms
+    assert loudest.min() > 0.8 * TILT_PEAK
+    assert loudest.max() < 1.1 * TILT_PEAK
+    assert strongest_hz(piece) == pytest.approx(880.0, abs=1.0)
 
 
 def test_a_beep_has_the_pitch_that_is_asked_for():
@@ -65,4 +71,6 @@ def test_samples_come_back_from_the_file(tmp_path):
     with wave.open(str(tmp_path / "taken.wav")) as file:
         assert (file.getnchannels(), file.getsampwidth(), file.getframerate()) == (1, 2, RATE_HZ)
         read = np.frombuffer(file.readframes(file.getnframes()), "<i2") / 32767
-    np.testing.assert_allclose(read, samples, atol=1 / 32767)
+    np.testing.assert_allclose(read[: len(samples)], samples, atol=1 / 32767)
+    assert not read[len(samples) :].any()
+    assert len(read) - len(samples) == pytest.approx(0.06 * RATE_HZ)
