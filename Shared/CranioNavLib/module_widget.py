@@ -28,6 +28,7 @@ class PanelOfModule:
         self.panel = show_in(self, PanelModel(self.panelDescription, self.logic))
         self.heard = Source(self.panel.model, self.palpated, self.probeGuide)
         SOUNDS.join(self.heard)
+        self.panel.say_of_sounds(SOUNDS.limits)
 
     def palpated(self) -> int:
         """Points that this module has taken in the recording under way: one more is heard."""

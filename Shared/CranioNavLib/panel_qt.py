@@ -102,6 +102,11 @@ class PanelWidget:
         self.sounds.show(sounds_are_on())
         self.refresh_live()
 
+    def say_of_sounds(self, limits: str) -> None:
+        """Say beside the switch what of the sounds cannot be heard; "" if all can."""
+        (info,) = SoundParameters.describe()
+        self.sounds.input.setToolTip("; ".join(filter(None, [info.help, limits])))
+
     def tick(self) -> None:
         """What the timer does: everything if the scene has changed, else what lives."""
         if self.model.scene_changed():

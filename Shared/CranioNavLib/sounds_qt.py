@@ -166,6 +166,11 @@ class PanelSounds:
             self._ticker = Ticker(None, TICK_MS, self.listen)
         self._ticker.start()
 
+    @property
+    def limits(self) -> str:
+        """What cannot be heard on this computer, in words; "" if nothing."""
+        return self.instrument.limits if self.instrument is not None else ""
+
     def leave(self, source: Source) -> None:
         """Listen to it no more; the last one ends it all, for sounds must not outlive the application."""
         if source in self._sources:

@@ -307,6 +307,14 @@ def test_the_switch_in_the_panel_reaches_the_scene_and_the_other_panels(heard_by
         widget.cleanup()
 
 
+def test_the_switch_says_what_this_computer_cannot_play(monkeypatch):
+    monkeypatch.setattr(sounds_qt, "SOUNDS", PanelSounds(Beeper))
+    widget = __import__("ModuleUltrasound").ModuleUltrasoundWidget()
+    widget.setup()
+    assert widget.panel.sounds.input.toolTip().endswith(Beeper.limits)
+    widget.cleanup()
+
+
 def test_pitches_that_are_kept_ready_span_those_of_the_guide():
     assert PITCHES_HZ[0] == pytest.approx(cue(30.0).pitch_hz, rel=0.01)
     assert PITCHES_HZ[-1] == pytest.approx(cue(0.0).pitch_hz, rel=0.01)
