@@ -108,13 +108,26 @@ def targets() -> Array:
     InputError
         There is none of these.
     """
+    return targets_found_by()()
+
+
+def targets_found_by() -> Callable[[], Array]:
+    """What finds these, in any thread: the scene is asked now, but places all over a fine mesh take half a second.
+
+    Raises
+    ------
+    InputError
+        There is nothing to find them by.
+    """
     from ModuleRegistrationLib.procedure import DEFAULT_TARGETS, spread_over
 
     for role in ("TargetsCT", "OuterTable", "LandmarksCT"):
         if not lacking(role) and role == "OuterTable":
-            return spread_over(scene_data.get_surface(role).vertices_mm, DEFAULT_TARGETS)
+            vertices = scene_data.get_surface(role).vertices_mm
+            return lambda: spread_over(vertices, DEFAULT_TARGETS)
         if not lacking(role):
-            return scene_data.get_points(role).positions_mm
+            positions = scene_data.get_points(role).positions_mm
+            return lambda: positions
     raise InputError("there are no targets in the CT to tell an error at; load or find them, or find the bone")
 
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 LOG = logging.getLogger(__name__)
 POLL_MS = 200
 LOOK_EVERY_S = 0.5  # for points that have come; it takes a fraction of a millisecond
-SHARE_OF_TIME = 0.2  # of one core that refining may take: of a gliding probe points come all the time
+SHARE_OF_TIME = 0.5  # of one core that refining may take: of a gliding probe points come all the time
 NEEDED = ("OuterTable", "LandmarksCT", "LandmarksPatient", "SurfacePoints")
 
 
@@ -112,7 +112,7 @@ class RefiningStep(RegisteringSteps):
 
     def _begin(self, given: _Given) -> None:
         try:
-            _, problem, places = self._problem()
+            _, problem, find_places = self._problem()
             method = self.createPlugin("registration", self.parameters().read().method)
         except InputError as error:
             self._keepFormer(len(self._labels()), str(error))
@@ -122,7 +122,7 @@ class RefiningStep(RegisteringSteps):
             from ModuleRegistrationLib.registration.verdict import FOR_GUIDANCE, judge
 
             result = method.register(problem)
-            return result, judge(problem, result, places, FOR_GUIDANCE)
+            return result, judge(problem, result, find_places(), FOR_GUIDANCE)
 
         if self._worker is None:
             self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="cranionav-refine")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Optional, Union
 
@@ -14,7 +15,7 @@ from CranioNavLib.slicer_files import LabelledPoints
 
 from ModuleRegistrationLib import quantities as names
 from ModuleRegistrationLib.logic import results
-from ModuleRegistrationLib.logic.given import RegistrationStep, lacking, of_this_ct, pairs, promised, targets
+from ModuleRegistrationLib.logic.given import RegistrationStep, lacking, of_this_ct, pairs, promised, targets_found_by
 
 if TYPE_CHECKING:
     from ModuleRegistrationLib.registration.error_theory import PredictedTre
@@ -124,12 +125,12 @@ class RegisteringSteps(RegistrationStep):
         from ModuleRegistrationLib.registration.error_theory import predict_tre_of
         from ModuleRegistrationLib.registration.verdict import judge
 
-        landmarks, problem, places = self._problem()
+        landmarks, problem, find_places = self._problem()
         method = self.createPlugin("registration", self.parameters().read().method)
 
         def register(progress: Progress) -> Judged:
             progress(f"registering with {method.name}", 0.1)
-            result = method.register(problem)
+            result, places = method.register(problem), find_places()
             progress("judging the result", 0.8)
             predicted = predict_tre_of(result, places) if result.covariance is not None else None
             return result, judge(problem, result, places), predicted
@@ -141,7 +142,7 @@ class RegisteringSteps(RegistrationStep):
         """Why the surface cannot be registered now."""
         return lacking("OuterTable", "LandmarksCT", "LandmarksPatient", "SurfacePoints")
 
-    def _problem(self) -> tuple[LandmarkRegistration, RegistrationProblem, Array]:
+    def _problem(self) -> tuple[LandmarkRegistration, RegistrationProblem, Callable[[], Array]]:
         from ModuleRegistrationLib.registration.problem import RegistrationProblem
 
         wanted, landmarks = self.parameters().read(), self._landmarks()
@@ -154,7 +155,7 @@ class RegisteringSteps(RegistrationStep):
             landmarks_patient_mm=patient,
             **promised(),
         )
-        return landmarks, problem, targets()
+        return landmarks, problem, targets_found_by()
 
     def _takeSurface(
         self,
