@@ -115,6 +115,28 @@ def test_a_session_killed_at_any_step_goes_on_exactly_where_it_was(a_recorded_pa
     assert scene_data.get_points("RegisteredPoints").labels
 
 
+def test_the_plan_comes_back_as_it_was_under_whatever_registration(tmp_path):
+    from CranioNavLib import scene
+
+    running = Workstation(tmp_path)
+    scene_data.set_volume("CT", Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), "nothing"))
+    node = scene_data.set_points("ProtocolPoints", LabelledPoints(("a", "b", "c"), 60.0 * np.eye(3)))
+    for axis, name in enumerate(("Normal_R", "Normal_A", "Normal_S")):
+        scene_data.add_measurement(node, name, np.eye(3)[:, axis])
+    running.logics["ModuleUltrasound"].goTo(2)
+    running.keep()
+    host.scene().Clear(False)
+    scene_data.set_transform("ReferenceToRas", np.diag([-1.0, -1.0, 1.0, 1.0])).SetAttribute(scene.STATUS_ATTRIBUTE, "accepted")
+    state = running.session.read_state(tmp_path)
+    assert running.session.restore_plan(state)
+    positions, normals, labels = running.logics["ModuleUltrasound"].protocolPoints()
+    assert labels == ("a", "b", "c")
+    np.testing.assert_array_equal(positions, 60.0 * np.eye(3))
+    np.testing.assert_array_equal(normals, np.eye(3))
+    assert state["asked_for"] == 2
+    assert not running.session.restore_plan({"planned": True}), "a session from before"
+
+
 def test_a_report_that_differs_from_the_screen_says_why(tmp_path):
     from CranioNavLib import scene
     from CranioNavLib.panel import Level

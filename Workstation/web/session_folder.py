@@ -149,7 +149,7 @@ class SessionFolder:
             "step": step,
             "simulated_seed": self.simulated_seed,
             "bone": scene.find("OuterTable") is not None,
-            "planned": scene.find("ProtocolPoints") is not None,
+            "plan": self._plan(),
             "points": scene.find("SurfacePoints") is not None,
             "asked_for": self._asked_for(),
             "tables": {role: scene_data.get_table(role) for role in TABLES if scene.find(role) is not None},
@@ -171,6 +171,17 @@ class SessionFolder:
     def _asked_for(self) -> int:
         node = scene.find("Protocol")
         return int(node.GetParameter("current") or 0) if node is not None else 0
+
+    def _plan(self) -> dict[str, Any] | None:
+        node = scene.find("ProtocolPoints")
+        if node is None or not node.GetNumberOfControlPoints():
+            return None
+        points, columns = scene_data.get_points("ProtocolPoints"), scene_data.read_measurements(node)
+        return {
+            "labels": list(points.labels),
+            "positions_mm": points.positions_mm.tolist(),
+            "measurements": {name: np.asarray(values).tolist() for name, values in columns.items()},
+        }
 
     def _registered_points(self) -> dict[str, Any] | None:
         node = scene.find("RegisteredPoints")
@@ -211,6 +222,20 @@ class SessionFolder:
                 value = node.GetParameter(name)
                 if name.endswith(PATHS) and value and not Path(value).exists() and (folder / Path(value).name).exists():
                     node.SetParameter(name, str(folder / Path(value).name))
+
+    def restore_plan(self, state: dict[str, Any]) -> bool:
+        """Set the points of the protocol as they were: planned anew under another registration they would lie elsewhere.
+
+        Returns whether there are any; sessions that were saved before the plan was have none. Main thread only.
+        """
+        kept = state.get("plan")
+        if not kept:
+            return False
+        points = LabelledPoints(tuple(kept["labels"]), np.array(kept["positions_mm"], dtype=float))
+        node = scene_data.set_points("ProtocolPoints", points)
+        for name, values in kept["measurements"].items():
+            scene_data.add_measurement(node, name, np.array(values, dtype=float))
+        return True
 
     def restore_registration(self, state: dict[str, Any]) -> None:
         """Set ReferenceToRas with its status, and the results. Main thread only."""

@@ -137,8 +137,11 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         if take is not None:
             take()
         self.session.restore_registration(state)
-        if state["planned"] and bone is not None:  # away from the clamp, which the registration places
+        planned = self.session.restore_plan(state)
+        if not planned and state.get("planned") and bone is not None:
             ultrasound.planProtocol()
+            planned = True
+        if planned:
             ultrasound.goTo(int(state.get("asked_for", 0)))
         self._go_to(state["step"])
         return "the session goes on where it was; connect the devices again"
