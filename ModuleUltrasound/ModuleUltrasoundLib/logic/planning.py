@@ -105,8 +105,10 @@ class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
             if not count:
                 return Reading("no pins known; touch them with the stylus to keep away from them")
             return Reading(f"{pins}; where they are on the head is known once the landmarks are registered", Level.WARNING)
-        known = f"{pins} and the reference base" if count else "no pins known (touch them with the stylus), the reference base"
-        said = f"{known}; the probe keeps {around.clearance_mm:g} mm away"
+        keeps = f"the probe keeps {around.clearance_mm:g} mm away"
+        said = f"no pins known: touch them with the stylus; {keeps} from the reference base"
+        if count:
+            said = f"{pins} and the reference base; {keeps}"
         near = self._tooNear(around)
         if near:
             stands = "1 point stands" if near == 1 else f"{near} points stand"
