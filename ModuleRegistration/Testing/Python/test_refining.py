@@ -51,7 +51,7 @@ def touch(patient, count, first=0):
     settle(patient)
 
 
-def settle(logic, seconds=10.0):
+def settle(logic, seconds=60.0):
     """The owner's event loop, until nothing is under way and nothing new is seen."""
     end = time.monotonic() + seconds
     for _ in range(3):
