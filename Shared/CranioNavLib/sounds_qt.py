@@ -72,9 +72,7 @@ class SoundEffects:
         self._folder = tempfile.TemporaryDirectory(prefix="cranionav-sounds-")  # removed when the process ends
         self._cues = {name: self._effect(name, cue_samples(name)) for name in CUES}
         self._beeps = [self._effect(f"beep-{round(pitch)}", beep_samples(pitch)) for pitch in PITCHES_HZ]
-        self._pieces = [
-            self._effect(f"steady-{turn}", steady_samples(STEADY_HZ)) for turn in (0, 1)
-        ]  # of the steady tone, by turns
+        self._pieces = [self._effect(f"steady-{turn}", steady_samples(STEADY_HZ)) for turn in (0, 1)]  # played by turns
         self._next_s = 0.0  # when the next beep, or piece, is due
         self._steady = False
 

@@ -73,7 +73,7 @@ class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
         if now == before:
             return
         self._around = now
-        other_distance = before is not None and before.clearance_mm != now.clearance_mm
+        other_distance = before is not None and before.clearance_mm != now.clearance_mm and now.places_mm is not None
         try:
             if (self._tooNear(now) or other_distance) and not count_of("SurfacePoints"):
                 self.planProtocol()
