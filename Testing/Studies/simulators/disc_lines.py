@@ -156,7 +156,7 @@ def _draw_scene(rng: np.random.Generator, setup: Setup, frames: int) -> Scene:
     hand = draw_hand(rng, setup, frames)
     beam = draw_beam(rng, setup, hand)
     count = len(hand.place)
-    skin_us = np.zeros(count)
+    skin_us: Array = np.zeros(count)
     if setup.delay.length_mm:
         warmth = setup.delay.late + np.cumsum(rng.normal(0, 0.0001, count))
         skin_us = 2e3 * setup.delay.length_mm / setup.delay.speed_m_s * (1 + warmth)
