@@ -202,7 +202,7 @@ def add_bone(rng: np.random.Generator, scene: Scene, from_skin: Spectra) -> tupl
     if len(rows) == 0:
         return peak, relief_mm
     depth_mm = scene.ground.depth_mm[rows]
-    surface, relief_mm[rows] = _surface(rng, scene, rows)
+    surface, relief_mm[rows] = answer_of_surface(rng, scene, rows)
     once = surface * band.way(depth_mm)
     echo = bone_r * once
     peak[rows] = band.peaks(echo * scene.entered[rows], depth_mm * setup.us_mm)
@@ -217,7 +217,7 @@ def add_bone(rng: np.random.Generator, scene: Scene, from_skin: Spectra) -> tupl
     return peak, relief_mm
 
 
-def _surface(rng: np.random.Generator, scene: Scene, rows: npt.NDArray[np.intp]) -> tuple[Spectra, Array]:
+def answer_of_surface(rng: np.random.Generator, scene: Scene, rows: npt.NDArray[np.intp]) -> tuple[Spectra, Array]:
     """What the patch of bone makes of a pulse (rows, band), of 1 for a mirror met squarely; and relief on the axis, mm."""
     setup, hand, band = scene.setup, scene.hand, scene.band
     relief = _draw_relief(rng)
