@@ -61,7 +61,8 @@ class Scene:
     @property
     def bare(self) -> Bools:
         """Contact, and no bone below."""
-        return self.hand.touching & (self.hand.soft | (self.hand.hole == 2) | (self.setup.without == "tissue"))
+        without = self.hand.soft | (self.hand.hole == 2) | (self.setup.without == "tissue")
+        return np.asarray(self.hand.touching & without)
 
     @property
     def seen(self) -> Bools:
@@ -89,7 +90,7 @@ def _draw_scene(rng: np.random.Generator, setup: Setup, hand: Hand) -> Scene:
     speckle = bone_r * float(10 ** (-rng.uniform(34, 44) / 20))
     visible_mm = max(10.0, setup.deepest_mm + (7 if hand.hole.any() else 2))
     faintest = speckle * float(pulse.height(visible_mm)) / 1.4
-    gaps = hand.hole.any() or hand.soft.any()
+    gaps = bool(hand.hole.any() or hand.soft.any())
     if gaps and faintest < bone_r * pulse.height(hand.thick_mm).min() * 10 ** (-MOST_SNR_DB / 20):
         hand, gaps = replace(hand, hole=np.zeros_like(hand.hole), soft=np.zeros_like(hand.soft)), False
     noise = bone_r * float(pulse.height(hand.thick_mm.max())) * 10 ** (-setup.snr_db / 20)
@@ -218,7 +219,7 @@ def _face(scene: Scene, rng: np.random.Generator, bang: float) -> Complex:
     """The transmitted pulse, the delay line's echoes, bone heard through them, and gel on hair, over the pulse (n, band)."""
     setup, hand, pulse, skin = scene.setup, scene.hand, scene.pulse, scene.skin_us
     count = len(skin)
-    echoes = [(np.zeros(count), np.full(count, bang))]
+    echoes: list[tuple[Array, Array]] = [(np.zeros(count), np.full(count, bang))]
     hair = (hand.kind == "hair") * 0.3
     for number in range(1, MULTIPLES + 1):  # dies out within 1.5 mm
         echoes.append((skin + number * rng.uniform(0.35, 0.45), hair * 0.45**number * rng.uniform(0.5, 1, count)))
@@ -342,7 +343,7 @@ def simulate(rng: np.random.Generator, frames: int, setup: Setup | None = None) 
     setup = setup or draw_setup(rng)
     scene = _draw_scene(rng, setup, draw_hand(rng, setup, frames))
     hand, bang = scene.hand, float(rng.uniform(3, 10))
-    heights = np.zeros(len(hand.place))
+    heights: Array = np.zeros(len(hand.place))
     spectra = np.zeros((len(hand.place), len(scene.pulse.mhz)), dtype=np.complex64)
     if scene.seen.any():
         spectra += _bone(scene, rng)
