@@ -63,15 +63,16 @@ def test_recording_without_bone_has_no_truth():
 def test_sum_of_echoes_is_that_of_causal_attenuation(a_quiet_world):
     band = stroke_lines.Band(a_quiet_world, 2000)
     rng = np.random.default_rng(2)
-    height, time_us, tilted = rng.normal(size=(3, 30)), rng.uniform(1, 15, (3, 30)), rng.uniform(0, 0.1, (3, 30))
+    height, time_us, askew = rng.normal(size=(3, 30)), rng.uniform(1, 15, (3, 30)), np.array([0, 0.5, 2])
     loss = rng.uniform(0, 48 / band.centre_mhz, (3, 30))
-    found = band.series(stroke_lines.Echoes(height, time_us, loss, tilted))
+    found = band.series(stroke_lines.Echoes(height, time_us, loss, askew))
     causal = 1 - 2j / np.pi * (np.log(band.mhz / band.centre_mhz) - 1)
     for row in range(3):
-        lost = np.outer(loss[row] * np.log(10) / 20, causal) + tilted[row][:, None] + 2j * np.pi * time_us[row][:, None]
+        lost = np.outer(loss[row] * np.log(10) / 20, causal) + 2j * np.pi * time_us[row][:, None]
         expected = height[row] @ np.exp(-lost * band.mhz)
-        assert np.abs(found[row] - expected).max() < 0.004 * np.abs(height[row]).sum()
-        assert np.median(np.abs(found[row] - expected) / np.abs(expected).max()) < 1e-3
+        expected *= 0.5 ** ((askew[row] * band.mhz / band.centre_mhz) ** 2)
+        off = np.abs(band.pulse * (found[row] - expected))
+        assert off.max() < 1e-3 * np.abs(band.pulse).max() * np.abs(height[row]).sum()
 
 
 def test_dispersion_turns_the_phase_but_keeps_the_time_of_the_group(a_quiet_world):
@@ -79,7 +80,7 @@ def test_dispersion_turns_the_phase_but_keeps_the_time_of_the_group(a_quiet_worl
     band = stroke_lines.Band(world, 4000)
     two = np.array([[0.0], [6 / band.centre_mhz]])  # dB/MHz: the second echo has lost 6 dB
     ones = np.ones((2, 1))
-    lines = band.analytic(band.series(stroke_lines.Echoes(ones, 10 * ones, two, 0 * ones)))
+    lines = band.analytic(band.series(stroke_lines.Echoes(ones, 10 * ones, two, np.zeros(2))))
     peaks = np.abs(lines).argmax(axis=1) / band.sampling_mhz
     np.testing.assert_allclose(peaks, 10, atol=1.5 / band.sampling_mhz + 0.01)
     row = round(10 * band.sampling_mhz)
@@ -95,6 +96,15 @@ def test_delay_lines_echo_is_total_where_contact_is_lost(a_quiet_world):
     assert 3 <= total.sum() <= 20
     assert np.isnan(truth.depth_mm[total]).mean() > 0.8  # the others are touching down
     assert np.median(at_skin[truth.snr_db > 30]) < 0.3 * at_skin.max()
+
+
+def test_tilted_bone_loses_half_its_height_at_the_lobe_and_its_high_frequencies_first(a_quiet_world):
+    band = stroke_lines.Band(a_quiet_world, 4000)
+    one = np.full((2, 1), 10.0)
+    spectra = band.series(stroke_lines.Echoes(one, one, 0 * one, np.array([0.0, 1.0])))
+    lost = np.abs(spectra[1] / spectra[0])
+    found = np.interp(band.centre_mhz * np.array([0.5, 1.0, 1.4]), band.mhz, lost)
+    np.testing.assert_allclose(found, 0.5 ** np.array([0.25, 1, 1.96]), rtol=0.02)
 
 
 def test_bone_stays_where_it_is_while_the_probe_moves(a_quiet_world):

@@ -40,7 +40,8 @@ Complex = npt.NDArray[np.complex64]
 NEPER = np.log(10) / 20  # a decibel
 BLOCK = 32  # frequencies a block of a geometric series
 FAINT = 1e-4  # of a pulse's largest frequency: not simulated below
-DISPERSION_ERROR = 2e-3  # of an echo, at the band's end
+STRONG = 0.02  # of a pulse's largest frequency: so far out the dispersion is exact to DISPERSION_ERROR
+DISPERSION_ERROR = 2e-3
 MOST_NODES = 7
 GUARD_US, HEARD_US = 4.0, 2.0  # behind the last sample: what begins there goes round to the first; echoes end before
 SKULL_MM_US = 2.9
@@ -76,6 +77,8 @@ class Band:
         self.mhz, self.pulse = every[self.bins], spectrum[self.bins].astype(np.complex64)
         # dispersion that belongs to the attenuation, less what only turns the phase; zero at the centre, with its slope
         self.bend_mhz = self.mhz * (np.log(self.mhz / self.centre_mhz) - 1) + self.centre_mhz
+        level = np.abs(self.pulse)
+        self.most_bend_mhz = float(self.bend_mhz[level > STRONG * level.max()].max())
 
     def series(self, echoes: Echoes) -> Complex:
         """Sums of echoes over the pulse (n, band).
@@ -90,20 +93,22 @@ class Band:
         shares = _lagrange(lost, nodes) * (height * turn).astype(np.complex64)[:, None, :]
         blocks = -(-len(self.mhz) // BLOCK)
         starts = self.mhz[0] + np.arange(blocks) * (BLOCK * self.step_mhz)
-        fades = lost + echoes.tilted
-        coarse = _powers(echoes.time_us, fades, starts)[:, None] * shares[:, :, None]  # (n, nodes, blocks, m)
-        fine = _powers(echoes.time_us, fades, np.arange(BLOCK) * self.step_mhz).transpose(0, 2, 1)  # (n, m, BLOCK)
+        coarse = _powers(echoes.time_us, lost, starts)[:, None] * shares[:, :, None]  # (n, nodes, blocks, m)
+        fine = _powers(echoes.time_us, lost, np.arange(BLOCK) * self.step_mhz).transpose(0, 2, 1)  # (n, m, BLOCK)
         lines, echo_count = lost.shape
         sums = np.matmul(coarse.reshape(lines, -1, echo_count), fine).reshape(lines, len(nodes), -1)[:, :, : len(self.mhz)]
         bends = np.exp(2j / np.pi * np.outer(nodes, self.bend_mhz)).astype(np.complex64)
-        return np.asarray((sums * bends).sum(axis=1))
+        total = (sums * bends).sum(axis=1)
+        if echoes.askew.any():  # the wider the aperture in wavelengths, the narrower the lobe
+            total *= np.exp(-np.log(2) * np.outer(echoes.askew, self.mhz / self.centre_mhz) ** 2).astype(np.float32)
+        return np.asarray(total)
 
     def _nodes(self, lost: Array) -> Array:
         """Attenuations (Chebyshev's) between which the dispersion's phase may be interpolated."""
         if not lost.size:
             return np.zeros(1)
         low, high = float(lost.min()), float(lost.max())
-        half = (high - low) / np.pi * float(self.bend_mhz.max())
+        half = (high - low) / np.pi * self.most_bend_mhz
         errors = [half**count / (factorial(count) * 2 ** (count - 1)) for count in range(1, MOST_NODES)]
         count = 1 + sum(error > DISPERSION_ERROR for error in errors)
         places = np.cos(np.pi * (np.arange(count) + 0.5) / count)
@@ -138,12 +143,12 @@ def _powers(time_us: Array, lost: Array, mhz: Array) -> Complex:
 
 @dataclass(frozen=True, eq=False)
 class Echoes:
-    """Echoes in each of n lines; every array is (n, m)."""
+    """Echoes in each of n lines; all of them answer tilt alike."""
 
-    height: Array  # before any loss
-    time_us: Array
-    loss: Array  # dB/MHz, with the dispersion that belongs to it
-    tilted: Array  # neper/MHz that tilt takes away, without dispersion
+    height: Array  # (n, m) before any loss
+    time_us: Array  # (n, m)
+    loss: Array  # (n, m) dB/MHz, with the dispersion that belongs to it
+    askew: Array  # (n,) tilt over the one at which the pulse's centre has lost 6 dB; 0: they answer all tilts
 
 
 class Scene:
@@ -194,21 +199,17 @@ class Scene:
         """dB/MHz, there and back in tissue."""
         return 0.2 * self.world.attenuation * depth_mm
 
-    def tilted(self, lobe_deg: float) -> Array:
-        """Neper/MHz (n, 1) that tilt takes from what answers half as high at `lobe_deg`."""
-        return np.asarray(np.log(2) / self.world.centre_mhz * (self.hand.angle_deg[:, None] / lobe_deg) ** 2)
+    def add(self, height: Array, time_us: Array, loss: Array, lobe_deg: npt.ArrayLike = np.inf) -> None:
+        """Echoes (n, m), half as high at a tilt of `lobe_deg`, one for all lines or (n,)."""
+        self.found.append(Echoes(height, time_us, loss, self.hand.angle_deg / lobe_deg))
 
-    def add(self, height: Array, time_us: Array, loss: Array, tilted: npt.ArrayLike = 0.0) -> None:
-        """Echoes (n, m); what has one column holds for all of them."""
-        parts = np.broadcast_arrays(height, time_us, loss, np.asarray(tilted, dtype=float))
-        self.found.append(Echoes(*(np.asarray(part) for part in parts)))
-
-    def take(self) -> Echoes:
-        """All echoes added since the last call, as one."""
-        names = ("height", "time_us", "loss", "tilted")
-        together = [np.concatenate([getattr(one, name) for one in self.found], axis=1) for name in names]
+    def take(self, band: Band) -> Complex:
+        """All echoes added since the last call, as analytic lines (n, samples)."""
+        spectra = np.zeros((self.lines, len(band.mhz)), dtype=np.complex64)
+        for echoes in self.found:
+            spectra += band.series(echoes)
         self.found = []
-        return Echoes(*together)
+        return band.analytic(spectra)
 
 
 def _add_surface(scene: Scene) -> None:
@@ -216,7 +217,7 @@ def _add_surface(scene: Scene) -> None:
     world, rng, depth = scene.world, scene.rng, scene.hand.depth_mm
     slope = np.tan(np.radians(scene.hand.angle_deg))
     near = (depth - rng.uniform(0, 0.5, scene.lines) * slope)[:, None]
-    scene.add(scene.bone[:, None], scene.arrival_us(near), scene.loss(near), scene.tilted(world.lobe_deg))
+    scene.add(scene.bone[:, None], scene.arrival_us(near), scene.loss(near), world.lobe_deg)
     spread = np.hypot(world.rough_mm, 0.4 * slope)[:, None]
     fine = depth[:, None] + scene.wander(FINE_ECHOES, 0.8) * spread
     height = world.floor / np.sqrt(FINE_ECHOES) * scene.bone[:, None] * scene.wander(FINE_ECHOES, 0.8)
@@ -234,10 +235,10 @@ def _add_behind_bone(scene: Scene) -> None:
     within = scene.each(np.concatenate([outer, inner, diploe], axis=1))
     height = scene.each(np.concatenate([tables, grains], axis=1)) * (1 + 0.3 * scene.wander(10, 0.8))
     time = scene.arrival_us(depth) + 2 * within / SKULL_MM_US
-    scene.add(bone * height, time, scene.loss(depth) + 0.1 * within, scene.tilted(2 * world.lobe_deg))
+    scene.add(bone * height, time, scene.loss(depth) + 0.1 * within, 2 * world.lobe_deg)
     times = np.array([2, 3])
     again = bone**times * (-scene.face_r[:, None]) ** (times - 1)
-    scene.add(again, scene.arrival_us(times * depth), scene.loss(times * depth), scene.tilted(world.lobe_deg / 2))
+    scene.add(again, scene.arrival_us(times * depth), scene.loss(times * depth), world.lobe_deg / 2)
 
 
 def _draw_layers(rng: np.random.Generator, bone_mm: float) -> tuple[Array, Array]:
@@ -264,8 +265,8 @@ def _add_tissue(scene: Scene) -> None:
     depths, heights = (np.array(parts)[hand.place, scene.soft.astype(int)] for parts in zip(*drawn))
     depth = depths * hand.pressed[:, None] + 0.03 * scene.wander(LAYERS, 0.85)
     height = wet * heights * (1 + 0.3 * scene.wander(LAYERS, 0.8))
-    lobe_deg = np.where(scene.soft, rng.uniform(4, 8), rng.uniform(4, 8))[:, None]
-    scene.add(height, scene.arrival_us(depth), scene.loss(depth), scene.tilted(1.0) / lobe_deg**2)
+    lobe_deg = np.where(scene.soft, rng.uniform(4, 8), rng.uniform(4, 8))
+    scene.add(height, scene.arrival_us(depth), scene.loss(depth), lobe_deg)
     bone = hand.depth_mm[:, None]
     deepest = np.where(scene.soft[:, None], 24.0, bone)
     depth = 0.3 + (deepest - 0.35) * scene.each(rng.random((scene.places, SCATTERERS)))
@@ -287,14 +288,14 @@ def _add_delay_line(scene: Scene) -> None:
     loss = np.broadcast_to(world.delay_loss * (times - 1), (scene.lines, 3))
     scene.add(end**times * world.back_r ** (times - 1), skin_us * times, loss)
     riding = 2 * scene.bone[:, None] * end * world.back_r
-    scene.add(riding, scene.arrival_us(depth) + skin_us, scene.loss(depth) + world.delay_loss, scene.tilted(world.lobe_deg))
+    scene.add(riding, scene.arrival_us(depth) + skin_us, scene.loss(depth) + world.delay_loss, world.lobe_deg)
 
 
 def _square_heights(scene: Scene, band: Band) -> Array:
     """Height of the envelope of bone met squarely in each place (P,)."""
     depth = scene.world.place_mm[:, None]
     time = scene.skin_us[0] + 2e3 * depth / scene.world.speed_m_s
-    echo = Echoes(np.full_like(depth, TYPICAL_BONE_R), time, scene.loss(depth), np.zeros_like(depth))
+    echo = Echoes(np.full_like(depth, TYPICAL_BONE_R), time, scene.loss(depth), np.zeros(len(depth)))
     return np.asarray(np.abs(band.analytic(band.series(echo))).max(axis=1), dtype=float)
 
 
@@ -359,11 +360,11 @@ def simulate(rng: np.random.Generator, frames: int, world: World | None = None) 
     last_us = float(scene.skin_us.max()) + 2e3 * world.reach_mm / world.speed_m_s
     band = Band(world, int(last_us * world.acquisition.sampling_hz * 1e-6))
     _add_surface(scene)
-    bone = band.analytic(band.series(scene.take()))
+    bone = scene.take(band)
     _add_behind_bone(scene)
     _add_tissue(scene)
     _add_delay_line(scene)
-    others = band.analytic(band.series(scene.take()))
+    others = scene.take(band)
     square = _square_heights(scene, band)
     sigma = float(square.min() / decibel(world.snr_db))
     rf = _draw_noise(rng, band, scene.lines) * np.float32(sigma) + bone.real + others.real
