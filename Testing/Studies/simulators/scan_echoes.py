@@ -61,7 +61,7 @@ class Pulse:
 def _pulse_of(probe: Probe, centre_mhz: float, rate_mhz: float) -> Pulse:
     """Its envelope's peak is 1 and stands at time zero."""
     raw = Pulse(probe, centre_mhz)
-    mhz = np.fft.rfftfreq(PULSE_SAMPLES, 1 / rate_mhz)
+    mhz = np.asarray(np.fft.rfftfreq(PULSE_SAMPLES, 1 / rate_mhz), dtype=float)
     spectrum = raw.spectrum(mhz)
     level = np.abs(np.fft.ifft(spectrum, PULSE_SAMPLES))
     top = int(level.argmax())
@@ -135,7 +135,7 @@ def _draw_ground(rng: np.random.Generator, setup: Setup, hand: Hand) -> Ground:
     bone_r = float((impedance - 1.63) / (impedance + 1.63))
     if setup.without == "soft":  # as of a neck or a cheek
         count = int(rng.integers(4, 8))
-        shares = np.sort(rng.uniform(0.08, 1.0, count))
+        shares: Array = np.sort(rng.uniform(0.08, 1.0, count))
         reflections = rng.choice([-1, 1], count) * rng.uniform(0.03, 0.1, count)
         thick = np.full(len(hand.depth_mm), rng.uniform(16, 22))
     else:
@@ -144,7 +144,7 @@ def _draw_ground(rng: np.random.Generator, setup: Setup, hand: Hand) -> Ground:
             layers.append((rng.uniform(0.35, 0.5), rng.uniform(0.02, 0.1)))
         if rng.random() < 0.5:  # close above bone
             layers.append((rng.uniform(0.85, 0.93), rng.uniform(0.02, 0.09)))
-        shares, reflections = np.array(layers).T
+        shares, reflections = (np.array(column) for column in zip(*layers))
         thick = hand.depth_mm
     hole = None
     part = min(1.0, len(hand.place) / USUAL_LINES)  # a shorter way comes over fewer holes

@@ -62,7 +62,7 @@ def simulate(rng: np.random.Generator, frames: int, setup: Setup | None = None) 
         acquisition=acquisition_of(setup, scene.probe),
         probe_to_reference=np.where(tracked[:, None, None], poses, np.nan),
         statuses=statuses,
-        timestamps_s=np.arange(len(lines)) * setup.line_s + rng.uniform(0, 100),
+        timestamps_s=np.asarray(np.arange(len(lines)) * setup.line_s + rng.uniform(0, 100), dtype=float),
         palpation_points=hand.place + 1 if numbered else np.full(len(lines), -1),
     )
     answers = (peak > 0) & (missing <= GAP)
@@ -112,10 +112,10 @@ def _through(scene: Scene, reflections: Floats) -> Complex:
 def _heard(scene: Scene, spectra: Complex, size: int, step: int) -> Complex:
     """Analytic signals at the line's own rate of `spectra` on the fine grid, after `step` times STEP_DB of loss and the pulse."""
     setup, coarse = scene.setup, size // scene.finer
-    mhz = np.arange(coarse // 2 + 1) * (scene.rate_mhz / size)
+    mhz = np.asarray(np.arange(coarse // 2 + 1) * (scene.rate_mhz / size), dtype=float)
     pulse = scene.pulse.spectrum(mhz)
-    band = np.flatnonzero(np.abs(pulse) > FAINT * np.abs(pulse).max())
-    band = slice(int(band[0]), int(band[-1]) + 1)
+    loud = np.flatnonzero(np.abs(pulse) > FAINT * np.abs(pulse).max())
+    band = slice(int(loud[0]), int(loud[-1]) + 1)
     mhz = mhz[band]
     nepers = NEPER * STEP_DB * step * mhz / setup.centre_mhz
     octaves = np.log(np.maximum(mhz, 1e-3) / setup.centre_mhz)

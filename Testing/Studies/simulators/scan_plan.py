@@ -112,7 +112,7 @@ class Hand:
     @property
     def angle_deg(self) -> Array:
         """Between beam and perpendicular (n,)."""
-        return np.degrees(np.arctan(np.hypot(*np.tan(np.radians(self.tilt_deg)).T)))
+        return np.asarray(np.degrees(np.arctan(np.hypot(*np.tan(np.radians(self.tilt_deg)).T))))
 
     @property
     def contact(self) -> Bools:
@@ -326,7 +326,7 @@ def draw_statuses(rng: np.random.Generator, count: int) -> tuple[str, ...]:
     return tuple(str(rng.choice(["MISSING", "INVALID", "OUT_OF_VIEW"])) if gone else "OK" for gone in lost)
 
 
-def _unit(vectors: Array) -> Array:
+def _unit(vectors: npt.NDArray[np.floating]) -> Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
