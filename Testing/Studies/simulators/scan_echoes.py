@@ -137,7 +137,7 @@ def _draw_ground(rng: np.random.Generator, setup: Setup, hand: Hand) -> Ground:
         count = int(rng.integers(4, 8))
         shares: Array = np.sort(rng.uniform(0.08, 1.0, count))
         reflections = rng.choice([-1, 1], count) * rng.uniform(0.03, 0.1, count)
-        thick = np.full(len(hand.depth_mm), rng.uniform(16, 22))
+        thick: Array = np.full(len(hand.depth_mm), rng.uniform(16, 22))
     else:
         layers = [(rng.uniform(0.15, 0.3), -rng.uniform(0.04, 0.16)), (rng.uniform(0.5, 0.72), rng.uniform(0.03, 0.12))]
         if hand.depth_mm.max() > 8:
