@@ -22,6 +22,7 @@ from ModuleUltrasoundLib.panel_description import UltrasoundParameters
 
 LOG = logging.getLogger(__name__)
 CHANGES = 16  # of the point asked for that are remembered: no line waits for longer
+MOST_NAMED = 3  # points in a line of the panel
 CURRENT_POINT = "current"  # parameter of the Protocol node: index of the point to palpate now
 NORMALS = ("Normal_R", "Normal_A", "Normal_S")  # measurements of ProtocolPoints: outward normals of the bone
 
@@ -39,6 +40,8 @@ class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
         self._changes: deque[tuple[float, int]] = deque(maxlen=CHANGES)  # when another point was asked for, and which was before
         self._around: Optional[_Around] = None  # what the plan was last held to
         self._plannedAnew = False  # by itself, because of it
+        self._noFreePlace: tuple[str, ...] = ()  # labels of points that kept their place near clamp or base
+        self._leftOut: tuple[str, ...] = ()  # labels of points that have none
 
     def planProtocol(self) -> str:
         """Place the palpation points on the outer table; writes ProtocolPoints and Protocol. Returns a message."""
@@ -58,8 +61,14 @@ class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
             scene_data.add_measurement(node, name, planned.normals[:, axis])
         self.goTo(0)
         self._around, self._plannedAnew = around, False
-        missing = f"; no place to stand for {', '.join(planned.left_out)}" if planned.left_out else ""
-        return f"{len(planned.labels)} points{missing}"
+        self._noFreePlace, self._leftOut = planned.too_near, planned.left_out
+        said = [f"{len(planned.labels)} points", *self._lost()]
+        if planned.too_near:
+            said.append(
+                f"no free place within reach of {', '.join(planned.too_near)}: nearer to clamp or base than "
+                f"{around.clearance_mm:g} mm, asked for last"
+            )
+        return "; ".join(said)
 
     def keepClear(self) -> None:
         """Plan anew once a pin or the reference base is known to be in the way of a point, as long as none was palpated.
@@ -81,6 +90,10 @@ class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
         except InputError as error:
             LOG.warning("the points stay where they are: %s", error)
 
+    def _lost(self) -> list[str]:
+        """What is said of points that have no place at all."""
+        return [f"no place to stand for {', '.join(self._leftOut)} (no even bone, or a pin in it)"] if self._leftOut else []
+
     def recordsPoints(self) -> bool:
         """Whether points are being palpated: the plan must stay as it is."""
         return False
@@ -88,17 +101,18 @@ class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
     def _whatIsAround(self) -> _Around:
         return _Around(in_the_way(), self.parameters().read().clamp_clearance_mm)
 
-    def _tooNear(self, around: _Around) -> int:
-        """How many points of the plan do not keep clear of it."""
+    def _tooNear(self, around: _Around) -> tuple[str, ...]:
+        """Labels of the points of the plan that do not keep clear of it."""
         from ModuleUltrasoundLib.palpation.clamp import clear_of_clamp
 
         if not count_of("ProtocolPoints"):
-            return 0
-        positions, normals, _ = self.protocolPoints()
-        return int(np.sum(~clear_of_clamp(positions, normals, around.places_mm, around.clearance_mm)))
+            return ()
+        positions, normals, labels = self.protocolPoints()
+        clear = clear_of_clamp(positions, normals, around.places_mm, around.clearance_mm)
+        return tuple(label for label, free in zip(labels, clear) if not free)
 
     def clampPins(self) -> Reading:
-        """What is known of the head clamp and the reference base, how far the points keep from them, and how many do not."""
+        """What is known of clamp and reference base, how far the points keep from them, which do not, and why."""
         count, around = count_of("ClampPins"), self._whatIsAround()
         pins = f"{count} pin{'s' if count > 1 else ''}"
         if around.places_mm is None:
@@ -109,11 +123,15 @@ class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
         said = f"no pins known: touch them with the stylus; {keeps} from the reference base"
         if count:
             said = f"{pins} and the reference base; {keeps}"
+        said = "; ".join([said, *self._lost()])
         near = self._tooNear(around)
         if near:
-            stands = "1 point stands" if near == 1 else f"{near} points stand"
-            return Reading(f"{said}; {stands} nearer and will be asked for last", Level.WARNING)
-        return Reading(said + ("; the points were planned anew" if self._plannedAnew else ""), Level.GOOD)
+            stands = "1 point stands" if len(near) == 1 else f"{len(near)} points stand"
+            named = f" ({', '.join(near)})" if len(near) <= MOST_NAMED else ""
+            why = ", as there is no free place within reach," if set(near) <= set(self._noFreePlace) else ""
+            return Reading(f"{said}; {stands} nearer{named}{why} and will be asked for last", Level.WARNING)
+        anew = "; the points were planned anew" if self._plannedAnew else ""
+        return Reading(said + anew, Level.WARNING if self._leftOut else Level.GOOD)
 
     def planProtocolBlocked(self) -> str:
         """Why no points can be placed now."""

@@ -7,7 +7,7 @@ the windows the points are chosen so that together they hold all six degrees of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Optional
 
@@ -17,7 +17,9 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import Array, invert_rigid, transform_directions, transform_points
 from CranioNavLib.surface import Surface
 
-from ModuleUltrasoundLib.palpation.clamp import CLEARANCE_MM, clear_of_clamp
+from ModuleUltrasoundLib.palpation.beside import places_beside
+from ModuleUltrasoundLib.palpation.clamp import CLEARANCE_MM, clear_of_clamp, stands_beside_pins
+from ModuleUltrasoundLib.palpation.footprint import STAND_OFF_MM, probe_footprint
 from ModuleUltrasoundLib.palpation.head_frame import head_frame
 
 REGIONS = ("Left lateral", "Right lateral", "Frontal convexity", "Forehead", "Periorbital")
@@ -38,12 +40,8 @@ PAIRS = {
 MOST_LEFT_OUT = 4  # a craniotomy takes the place of one or two points; more are missing where the CT is cut off
 WINDOW_RADII_DEG = (12.0, 17.0, 23.0)  # tried in turn: a window that holds a defect or a clamp is widened
 GRID_STEP_DEG = 1.8
+GRID_STEP_MM = 2.8  # of the same, on the bone
 
-PROBE_FACE_RADIUS_MM = 2.5  # 5 mm element
-PROBE_BODY_RADIUS_MM = 7.0  # housing that must not meet bone beside the point
-STAND_OFF_MM = 40.0  # a probe comes in from here without touching bone
-LARGEST_STEP_MM = 2.5  # of the bone under the probe's body
-LARGEST_ROUGHNESS_MM = 0.45  # RMS from the plane through the bone under the body
 SMALLEST_SPACING_MM = 20.0
 ADULT_LENGTH_MM = 178.0  # nasion to opisthocranion, where the CT does not reach the back of the head
 NORMAL_SD_MM = 0.6  # of a bone point along the surface normal: one value for all, only ratios matter here
@@ -51,7 +49,8 @@ HEAD_RADIUS_MM = 75.0
 ROUGHNESS_WEIGHT = 0.05  # mm^2 of predicted error that an ideal place is worth against one at a window's rim
 PRIOR_SD_MM = 3.0  # landmark registration, per axis; keeps the information regular with few points
 
-_Obstacles = tuple[Optional[npt.ArrayLike], float]  # points in the probe's way, RAS, and the distance to keep from them
+_Stands = Callable[[Array, Array], npt.NDArray[np.bool_]]  # feet and normals (M, 3) to whether a probe may stand there (M,)
+_Key = tuple[str, int]  # a window: a pair's name and -1 for its left, 1 for its right one
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +62,21 @@ class ProtocolPoints:
     normals: Array  # (N, 3) unit, of the plane through the bone under the probe
     regions: tuple[str, ...]
     head_to_ras: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) origin at the nasion, x right, y anterior, z up
-    left_out: tuple[str, ...] = ()  # labels of points whose place is taken by an opening of the skull, the clamp or the base
+    left_out: tuple[str, ...] = ()  # labels of points whose place is taken by an opening of the skull, or by a pin
+    too_near: tuple[str, ...] = ()  # labels of points that keep their place near clamp or base: there is no free one in reach
 
     def __len__(self) -> int:
         return len(self.labels)
+
+
+@dataclass(frozen=True, eq=False)
+class _Head:
+    """What the windows are looked at through."""
+
+    surface: Surface
+    head_to_ras: Array  # (4, 4)
+    center: Array  # (3,) RAS, mm: the point that they are seen from
+    reach_mm: float  # from there, outside the head in every direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +85,7 @@ class _Spot:
 
     position: Array  # (3,)
     normal: Array  # (3,)
-    offset: tuple[int, int]  # grid place within the window, the same number on both sides of the head
+    offset: Optional[tuple[int, int]]  # grid place within the window, the same number on both sides of the head; None beside it
     penalty: float
 
 
@@ -106,7 +116,9 @@ def plan_protocol(
     -------
     ProtocolPoints
         Three left lateral, three right lateral, four each on frontal convexity, forehead and around the orbits; without
-        those whose place, and all around it, is an opening of the skull or under clamp or base.
+        those whose place, and all around it, is an opening of the skull. Clamp and base take none away: where they are in
+        the way of all of a window, the point moves along the bone of its region; where there is no free place in reach, it
+        keeps its own and is named in `too_near`. Only a place that a pin sits in is none.
 
     Raises
     ------
@@ -114,15 +126,18 @@ def plan_protocol(
         Landmarks and labels differ in number, or the surface lacks a region of the protocol or more than four places.
     """
     head_to_ras = head_frame(surface, landmarks_ras_mm, labels)
-    center, reach = _middle(surface, head_to_ras)
-    windows: dict[tuple[str, int], list[_Spot]] = {}
-    obstacles = (clamp_ras_mm, clearance_mm)
-    for name in PAIRS:
-        for side in (-1, 1):
-            windows[name, side] = _spots_for(surface, head_to_ras, center, reach, name, side, obstacles)
+    head = _Head(surface, head_to_ras, *_middle(surface, head_to_ras))
+
+    def stands(positions: Array, normals: Array) -> npt.NDArray[np.bool_]:
+        return stands_beside_pins(positions, normals, clamp_ras_mm, clearance_mm)
+
+    def is_clear(positions: Array, normals: Array) -> npt.NDArray[np.bool_]:
+        return clear_of_clamp(positions, normals, clamp_ras_mm, clearance_mm)
+
+    windows = {(name, side): _spots_for(head, (name, side), stands) for name in PAIRS for side in (-1, 1)}
     left_out = _check_left_out(windows)
-    windows = {key: spots for key, spots in windows.items() if spots}
-    chosen = _choose(windows, center)
+    windows, too_near = _clear_windows(head, {key: spots for key, spots in windows.items() if spots}, is_clear)
+    chosen = _choose(windows, head.center)
     names, spots, regions = [], [], []
     for region in REGIONS:
         for label, key in _slots(region):
@@ -138,24 +153,71 @@ def plan_protocol(
         regions=tuple(regions),
         head_to_ras=head_to_ras,
         left_out=tuple(label for region in REGIONS for label, key in _slots(region) if key in left_out),
+        too_near=tuple(label for region in REGIONS for label, key in _slots(region) if key in too_near),
     )
 
 
-def _check_left_out(windows: dict[tuple[str, int], list[_Spot]]) -> list[tuple[str, int]]:
-    """The windows over an opening, which hold no place; refused where there are many, or all of a region."""
+def _clear_windows(
+    head: _Head, windows: dict[_Key, list[_Spot]], is_clear: _Stands
+) -> tuple[dict[_Key, list[_Spot]], list[_Key]]:
+    """Of each window the places clear of clamp and base; where it has none those beside it, else its own, which is named."""
+    clear = {key: _those(spots, is_clear) for key, spots in windows.items()}
+    blocked = [key for key, spots in clear.items() if not spots]
+    too_near = []
+    if blocked:
+        own = _choose(windows, head.center)
+        for key in blocked:
+            others = np.array([spot.position for other, spot in own.items() if other != key])
+            clear[key] = _beside(head, key, own[key], others, is_clear) or _spots_for(head, key, is_clear)
+            if not clear[key]:
+                clear[key] = [own[key]]
+                too_near.append(key)
+    return clear, too_near
+
+
+def _those(spots: list[_Spot], stands: _Stands) -> list[_Spot]:
+    """Those of some places where a probe may stand."""
+    positions, normals = (np.array([getattr(spot, name) for spot in spots]).reshape(-1, 3) for name in ("position", "normal"))
+    return [spot for spot, good in zip(spots, stands(positions, normals)) if good]
+
+
+def _beside(head: _Head, key: _Key, own: _Spot, others: Array, is_clear: _Stands) -> list[_Spot]:
+    """Clear places of the same region farther along the bone; not among the other points, unless all are."""
+    positions, normals, roughness = places_beside(head.surface, own.position, own.normal)
+    ways = np.linalg.norm(positions - own.position, axis=1)
+    at_home = _of_region(transform_directions(invert_rigid(head.head_to_ras), positions - head.center), key)
+    found = [
+        _Spot(positions[k], normals[k], None, 0.02 * float(ways[k]) / GRID_STEP_MM + 0.5 * float(roughness[k]))
+        for k in np.flatnonzero(at_home & is_clear(positions, normals))
+    ]
+    spaced = [spot for spot in found if np.linalg.norm(others - spot.position, axis=1).min() >= SMALLEST_SPACING_MM]
+    return spaced or found
+
+
+def _of_region(directions: Array, key: _Key) -> npt.NDArray[np.bool_]:
+    """(M,) whether the window nearest to each direction (M, 3; head's frame) is of this one's region and side."""
+    keys = [(name, side) for name in PAIRS for side in (-1, 1)]
+    nearest = np.argmax(directions @ np.array([_outward(*one) for one in keys]).T, axis=1)
+    region = key[0].rsplit(" ", 1)[0]
+    its_own = np.array([name.rsplit(" ", 1)[0] == region and side == key[1] for name, side in keys])
+    return np.asarray(its_own[nearest])
+
+
+def _check_left_out(windows: dict[_Key, list[_Spot]]) -> list[_Key]:
+    """The windows over an opening or a pin, which hold no place; refused where there are many, or all of a region."""
     empty = [key for key, spots in windows.items() if not spots]
     bare = any(all(key in empty for _, key in _slots(region)) for region in REGIONS)
     if bare or len(empty) > MOST_LEFT_OUT:
         name, side = empty[0]
         raise InputError(
             f"no place for the probe at {'left' if side < 0 else 'right'} {name.lower()}: the bone surface is missing or too "
-            "rough there, or the clamp or the reference base is in the way; extend or mend the surface, check the landmarks that "
-            "orient the head, or lessen the distance from clamp and base"
+            "rough there, or a pin of the clamp sits in the place; extend or mend the surface, or check the landmarks that "
+            "orient the head"
         )
     return empty
 
 
-def _slots(region: str) -> list[tuple[str, tuple[str, int]]]:
+def _slots(region: str) -> list[tuple[str, _Key]]:
     """Labels of a region with the pair and side each stands for; across the forehead they run from left to right."""
     if region.endswith("lateral"):
         side = -1 if region.startswith("Left") else 1
@@ -173,10 +235,16 @@ def _middle(surface: Surface, head_to_ras: Array) -> tuple[Array, float]:
     return center, float(np.linalg.norm(surface.vertices_mm - center, axis=1).max()) + STAND_OFF_MM
 
 
+def _outward(name: str, side: int) -> Array:
+    """The unit direction of a window's middle in the head's frame."""
+    azimuth, elevation = np.radians(PAIRS[name])
+    return np.array([side * np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
+
+
 def _directions(name: str, side: int, radius_deg: float) -> tuple[Array, list[tuple[int, int]]]:
     """Unit directions (M, 3) of a window's grid in the head's frame, and their places in the grid."""
-    azimuth, elevation = np.radians(PAIRS[name])
-    outward = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
+    azimuth = np.radians(PAIRS[name][0])
+    outward = _outward(name, 1)
     across = np.array([np.cos(azimuth), -np.sin(azimuth), 0.0])
     up = np.cross(across, outward)
     count = int(radius_deg / GRID_STEP_DEG)
@@ -188,13 +256,12 @@ def _directions(name: str, side: int, radius_deg: float) -> tuple[Array, list[tu
     return rays, places
 
 
-def _spots_for(
-    surface: Surface, head_to_ras: Array, center: Array, reach: float, name: str, side: int, obstacles: _Obstacles
-) -> list[_Spot]:
-    """Places of a window where a probe can stand; the window grows until it holds some, or is left empty."""
+def _spots_for(head: _Head, key: _Key, stands: _Stands) -> list[_Spot]:
+    """Places of a window where a probe may stand; the window grows until it holds some, or is left empty."""
+    surface, center, reach = head.surface, head.center, head.reach_mm
     for radius_deg in WINDOW_RADII_DEG:
-        rays, places = _directions(name, side, radius_deg)
-        outward = transform_directions(head_to_ras, rays)
+        rays, places = _directions(*key, radius_deg)
+        outward = transform_directions(head.head_to_ras, rays)
         hits = surface.cast(center + reach * outward, -outward)
         seen = np.isfinite(hits.distances_mm) & (hits.distances_mm < reach - 30.0)  # nearer the middle: through a hole
         if not seen.any():
@@ -204,64 +271,11 @@ def _spots_for(
         kept = [place for place, flag in zip(places, seen) if flag]
         spots = [
             _Spot(positions[k], normals[k], kept[k], 0.02 * float(np.hypot(*kept[k])) + 0.5 * float(roughness[k]))
-            for k in np.flatnonzero(good & clear_of_clamp(positions, normals, *obstacles))
+            for k in np.flatnonzero(good & stands(positions, normals))
         ]
         if spots:
             return spots
     return []
-
-
-def probe_footprint(surface: Surface, positions_mm: Array, outward: Array) -> tuple[Array, Array, Array, npt.NDArray[np.bool_]]:
-    """How a probe would stand on a surface at points (M, 3), coming in roughly along -`outward` (M, 3).
-
-    Returns
-    -------
-    positions (M, 3) on the surface, normals (M, 3) of the plane through the bone under the probe's body,
-    roughness (M,) RMS distance from that plane in mm, and (M,) whether a probe can stand there: bone under
-    all of its body, no step, nothing in the way of its approach.
-    """
-    axis = outward
-    for _ in range(2):  # the first plane straightens the approach, the second is measured along it
-        offsets, heights = _heights_under_probe(surface, positions_mm, axis)
-        whole = np.asarray(np.abs(heights).max(axis=1) < 2 * PROBE_BODY_RADIUS_MM)
-        slopes, roughness = _fit_planes(offsets, np.where(whole[:, None], heights, 0.0))
-        across, up = _tangents(axis)
-        normals = axis - slopes[:, :1] * across - slopes[:, 1:] * up
-        axis = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    step = np.abs(heights).max(axis=1)
-    good = whole & (step < LARGEST_STEP_MM) & (roughness < LARGEST_ROUGHNESS_MM)
-    return positions_mm, axis, roughness, good
-
-
-def _tangents(axis: Array) -> tuple[Array, Array]:
-    """Two unit vectors (M, 3) each, square to `axis` (M, 3) and to each other."""
-    helper = np.where(np.abs(axis[:, 2:]) < 0.9, np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 0.0]]))
-    across: Array = np.asarray(np.cross(helper, axis), dtype=float)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    return across, np.asarray(np.cross(axis, across), dtype=float)
-
-
-def _heights_under_probe(surface: Surface, positions: Array, axis: Array) -> tuple[Array, Array]:
-    """Heights (M, R) of the bone over the plane through each point square to `axis`; offsets (R, 2) in that plane."""
-    angles = np.arange(8) * np.pi / 4
-    circle = np.column_stack([np.cos(angles), np.sin(angles)])
-    offsets = np.concatenate([[[0.0, 0.0]], PROBE_FACE_RADIUS_MM * circle, PROBE_BODY_RADIUS_MM * circle])
-    across, up = _tangents(axis)
-    feet = positions[:, None] + offsets[None, :, :1] * across[:, None] + offsets[None, :, 1:] * up[:, None]
-    origins = feet + STAND_OFF_MM * axis[:, None]
-    rays = np.broadcast_to(-axis[:, None], origins.shape)
-    distances = surface.cast(origins.reshape(-1, 3), rays.reshape(-1, 3)).distances_mm.reshape(origins.shape[:2])
-    return offsets, STAND_OFF_MM - distances
-
-
-def _fit_planes(offsets: Array, heights: Array) -> tuple[Array, Array]:
-    """Slopes (M, 2) and RMS residual (M,) of planes fitted to heights (M, R) at offsets (R, 2)."""
-    design = np.column_stack([offsets, np.ones(len(offsets))])
-    solution = heights @ np.linalg.pinv(design).T
-    residuals: Array = heights - solution @ design.T
-    slopes: Array = solution[:, :2]
-    roughness: Array = np.sqrt(np.mean(residuals**2, axis=1))
-    return slopes, roughness
 
 
 def _rows(spots: Sequence[_Spot], center: Array) -> Array:
@@ -271,7 +285,7 @@ def _rows(spots: Sequence[_Spot], center: Array) -> Array:
     return rows
 
 
-def _choose(windows: dict[tuple[str, int], list[_Spot]], center: Array) -> dict[tuple[str, int], _Spot]:
+def _choose(windows: dict[_Key, list[_Spot]], center: Array) -> dict[_Key, _Spot]:
     """One spot a window, so that the mean squared error over the head is least; both sides alike where they can be."""
     chosen = {key: min(spots, key=lambda spot: spot.penalty) for key, spots in windows.items()}
     found = {name: _pairings(windows.get((name, -1), []), windows.get((name, 1), [])) for name in PAIRS}
@@ -294,7 +308,7 @@ def _pairings(left: list[_Spot], right: list[_Spot]) -> list[tuple[_Spot, _Spot]
     """
     if not (left and right):
         return [(spot, spot) for spot in left or right]
-    by_place = {spot.offset: spot for spot in right}
+    by_place = {spot.offset: spot for spot in right if spot.offset is not None}
     mirrored = [(spot, by_place[spot.offset]) for spot in left if spot.offset in by_place]
     if len(mirrored) >= 5:
         return mirrored

@@ -9,6 +9,7 @@ from CranioNavLib.panel import Level
 from CranioNavLib.panel_model import PanelModel
 from CranioNavLib.rigid import invert_rigid, rigid_from_vector, transform_points
 from CranioNavLib.slicer_files import LabelledPoints, load_scene, save_scene
+from CranioNavLib.surface import Surface
 from ModuleUltrasoundLib.palpation.clamp import CLEARANCE_LIMITS, CLEARANCE_MM, clear_of_clamp
 from ModuleUltrasoundLib.panel_description import PANEL, UltrasoundParameters
 
@@ -100,16 +101,58 @@ def test_a_pin_touched_after_planning_moves_the_points_near_it(a_planned_logic):
     assert clear(a_planned_logic, pin).all()
 
 
-def test_where_no_place_is_left_the_points_stay_and_it_is_said(a_planned_logic):
+def test_where_no_free_place_is_left_all_points_are_planned_and_those_in_the_way_are_named(a_planned_logic):
+    labels, base = a_planned_logic.protocolPoints()[2], over_point(a_planned_logic, 7)
+    a_planned_logic.parameters().change(clamp_clearance_mm=100.0)
+    register_with_base_at(base)
+    a_planned_logic.poll()
+    assert a_planned_logic.protocolPoints()[2] == labels
+    near = [label for label, free in zip(labels, clear(a_planned_logic, base, 100.0)) if not free]
+    assert 0 < len(near) < 18
+    said = a_planned_logic.clampPins()
+    assert said.level is Level.WARNING
+    stands = "1 point stands" if len(near) == 1 else f"{len(near)} points stand"
+    assert f"{stands} nearer" in said.text
+    assert "no free place within reach" in said.text
+    assert "asked for last" in said.text
+    assert "\n" not in said.text
     before = a_planned_logic.protocolPoints()[0]
-    register_with_base_at([0.0, 0.0, -250.0])
-    to_reference = invert_rigid(scene_data.get_transform("ReferenceToRas"))
-    pins = transform_points(to_reference, before)  # one at each point
-    scene_data.set_points("ClampPins", LabelledPoints(tuple(f"C{k}" for k in range(len(pins))), pins))
-    a_planned_logic.parameters().change(clamp_clearance_mm=60.0)
+    scene_data.set_points("SurfacePoints", LabelledPoints(("S1",), before[:1]))
+    register_with_base_at(over_point(a_planned_logic, 3))
     a_planned_logic.poll()
     np.testing.assert_array_equal(a_planned_logic.protocolPoints()[0], before)
-    assert a_planned_logic.clampPins().level is Level.WARNING
+
+
+def test_the_message_of_planning_counts_all_points_and_says_which_stand_near_and_why(a_planned_logic):
+    base = over_point(a_planned_logic, 7)
+    a_planned_logic.parameters().change(clamp_clearance_mm=100.0)
+    register_with_base_at(base)
+    said = a_planned_logic.planProtocol()
+    assert said.startswith("18 points; ")
+    near = next(
+        label for label, free in zip(a_planned_logic.protocolPoints()[2], clear(a_planned_logic, base, 100.0)) if not free
+    )
+    assert near in said
+    assert "asked for last" in said
+
+
+def test_a_point_that_a_pin_takes_the_only_place_of_is_named_in_the_panel(a_logic, a_head):
+    scene_data.set_surface("OuterTable", a_head)
+    a_logic.planProtocol()
+    cheek = a_logic.protocolPoints()[0][16]
+    far = np.linalg.norm(a_head.vertices_mm[a_head.triangles].mean(axis=1) - cheek, axis=1)
+    scene_data.set_surface("OuterTable", Surface(a_head.vertices_mm, a_head.triangles[(far < 9.0) | (far > 60.0)]))
+    assert a_logic.planProtocol().startswith("18 points")
+    register_with_base_at([0.0, 0.0, -250.0])
+    to_reference = invert_rigid(scene_data.get_transform("ReferenceToRas"))
+    scene_data.set_points(
+        "ClampPins", LabelledPoints(("C1",), transform_points(to_reference, over_point(a_logic, 16, 6.0)[None]))
+    )
+    a_logic.poll()
+    assert len(a_logic.protocolPoints()[2]) == 17
+    said = a_logic.clampPins()
+    assert said.level is Level.WARNING
+    assert "no place to stand for Periorbital 3 (no even bone, or a pin in it)" in said.text
 
 
 def test_the_distance_is_a_setting_with_limits_and_a_default(a_planned_logic, tmp_path):

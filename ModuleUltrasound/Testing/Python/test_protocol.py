@@ -8,8 +8,9 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import invert_rigid, rigid_from_vector, transform_directions, transform_points
 from CranioNavLib.surface import Surface
 from ModuleUltrasoundLib.palpation.clamp import clear_of_clamp
+from ModuleUltrasoundLib.palpation.footprint import probe_footprint
 from ModuleUltrasoundLib.palpation.head_frame import LANDMARK_LABELS
-from ModuleUltrasoundLib.palpation.protocol import REGIONS, plan_protocol, probe_footprint
+from ModuleUltrasoundLib.palpation.protocol import REGIONS, plan_protocol
 
 COUNTS = {"Left lateral": 3, "Right lateral": 3, "Frontal convexity": 4, "Forehead": 4, "Periorbital": 4}
 # Nasion at the origin of the head built below
@@ -131,9 +132,8 @@ def test_points_keep_clear_of_the_pins_of_the_head_clamp(a_skull):
     pins = free.positions_ras_mm[[free.labels.index(label) for label in ("Left lateral 1", "Right lateral 1", "Right lateral 2")]]
     plan = plan_protocol(a_skull, LANDMARKS, clamp_ras_mm=pins)
     assert clear_of_clamp(plan.positions_ras_mm, plan.normals, pins).all()
-    assert len(plan) == 18 - len(plan.left_out)
-    assert set(plan.labels) | set(plan.left_out) == set(free.labels)
-    assert len(plan.left_out) <= 1, "a window that holds a pin is widened"
+    assert plan.labels == free.labels
+    assert plan.too_near == plan.left_out == ()
 
 
 def test_points_keep_the_distance_that_is_asked_for(a_skull):
@@ -142,8 +142,67 @@ def test_points_keep_the_distance_that_is_asked_for(a_skull):
     for clearance_mm in (10.0, 45.0):
         plan = plan_protocol(a_skull, LANDMARKS, clamp_ras_mm=base, clearance_mm=clearance_mm)
         assert clear_of_clamp(plan.positions_ras_mm, plan.normals, base, clearance_mm).all()
-    with pytest.raises(InputError, match="lessen the distance from clamp and base"):
-        plan_protocol(a_skull, LANDMARKS, clamp_ras_mm=free.positions_ras_mm, clearance_mm=90.0)
+
+
+@pytest.mark.parametrize("clearance_mm", [30.0, 60.0, 100.0])
+@pytest.mark.parametrize(
+    ("direction", "distance_mm"),
+    [
+        ([0.0, 1.0, 0.3], 130.0),  # before the forehead
+        ([0.0, 1.0, 0.3], 170.0),
+        ([1.0, 0.1, 0.2], 130.0),  # at the side
+        ([-1.0, -0.2, -0.1], 110.0),  # beside the ear
+        ([0.6, 0.8, -0.25], 140.0),  # before the cheek
+        ([0.3, 0.2, 1.0], 150.0),  # over the vertex
+        ([1.0, 1.0, 1.0], 900.0),  # far away
+    ],
+)
+def test_a_base_takes_no_point_away_and_points_are_clear_of_it_or_named(a_skull, direction, distance_mm, clearance_mm):
+    free = plan_protocol(a_skull, LANDMARKS)
+    base = np.array([0.0, -88.0, 15.0]) + distance_mm * np.array(direction) / np.linalg.norm(direction)
+    plan = plan_protocol(a_skull, LANDMARKS, clamp_ras_mm=base[None], clearance_mm=clearance_mm)
+    assert plan.labels == free.labels
+    assert plan.regions == free.regions
+    clear = clear_of_clamp(plan.positions_ras_mm, plan.normals, base[None], clearance_mm)
+    assert plan.too_near == tuple(label for label, free_of_it in zip(plan.labels, clear) if not free_of_it)
+    if clearance_mm == 30.0:
+        assert plan.too_near == (), "an even skull has a free place beside each"
+    apart = np.linalg.norm(plan.positions_ras_mm[:, None] - plan.positions_ras_mm[None], axis=2) + 1e3 * np.eye(18)
+    assert apart.min() > 12.0
+    found = a_skull.closest(plan.positions_ras_mm)
+    assert np.degrees(np.arccos(np.sum(plan.normals * found.normals, axis=1))).max() < 4.0, "square to the bone"
+
+
+def a_cheek_alone(a_skull, radius_mm=16.0):
+    """The skull with nothing but an island of bone around its third periorbital point, and where that is."""
+    free = plan_protocol(a_skull, LANDMARKS)
+    cheek = free.positions_ras_mm[free.labels.index("Periorbital 3")]
+
+    def keep(middles):
+        far = np.linalg.norm(middles - cheek, axis=1)
+        return (far < radius_mm) | (far > 60.0)
+
+    alone = a_head(keep)
+    return alone, plan_protocol(alone, LANDMARKS)
+
+
+def test_a_point_without_a_free_place_in_reach_keeps_its_own_and_is_named(a_skull):
+    skull, free = a_cheek_alone(a_skull)
+    index = free.labels.index("Periorbital 3")
+    base = free.positions_ras_mm[index] + 80.0 * free.normals[index]
+    plan = plan_protocol(skull, LANDMARKS, clamp_ras_mm=base[None])
+    assert plan.labels == free.labels
+    assert plan.too_near == ("Periorbital 3",)
+    assert plan.positions_ras_mm[index] == pytest.approx(free.positions_ras_mm[index])
+
+
+def test_a_point_is_lost_only_where_a_pin_sits_in_its_place(a_skull):
+    skull, free = a_cheek_alone(a_skull, 9.0)
+    index = free.labels.index("Periorbital 3")
+    over = free.positions_ras_mm[index] + 6.0 * free.normals[index]  # on the skin
+    plan = plan_protocol(skull, LANDMARKS, clamp_ras_mm=over[None])
+    assert plan.left_out == ("Periorbital 3",)
+    assert set(free.labels) - set(plan.labels) == {"Periorbital 3"}
 
 
 def test_an_open_face_without_the_back_of_the_head_is_enough():
