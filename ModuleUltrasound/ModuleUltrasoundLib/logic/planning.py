@@ -92,7 +92,9 @@ class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
 
     def _lost(self) -> list[str]:
         """What is said of points that have no place at all."""
-        return [f"no place to stand for {', '.join(self._leftOut)} (no even bone, or a pin in it)"] if self._leftOut else []
+        if not (self._leftOut and count_of("ProtocolPoints")):
+            return []
+        return [f"no place to stand for {', '.join(self._leftOut)} (no even bone, or a pin in it)"]
 
     def recordsPoints(self) -> bool:
         """Whether points are being palpated: the plan must stay as it is."""
@@ -131,7 +133,7 @@ class ProtocolStep(DeviceInScene[UltrasoundParameters, LineStream]):
             why = ", as there is no free place within reach," if set(near) <= set(self._noFreePlace) else ""
             return Reading(f"{said}; {stands} nearer{named}{why} and will be asked for last", Level.WARNING)
         anew = "; the points were planned anew" if self._plannedAnew else ""
-        return Reading(said + anew, Level.WARNING if self._leftOut else Level.GOOD)
+        return Reading(said + anew, Level.WARNING if self._lost() else Level.GOOD)
 
     def planProtocolBlocked(self) -> str:
         """Why no points can be placed now."""
