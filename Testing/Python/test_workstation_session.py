@@ -137,6 +137,19 @@ def test_the_plan_comes_back_as_it_was_under_whatever_registration(tmp_path):
     assert not running.session.restore_plan({"planned": True}), "a session from before"
 
 
+def test_a_session_that_goes_on_can_be_killed_at_once(tmp_path):
+    """Its CT is the folder's own: it is not written again, which would take the state away until that is done."""
+    began = Workstation(tmp_path)
+    scene_data.set_volume("CT", Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), "nothing"))
+    began.keep()
+    host.scene().Clear(False)
+    again = Workstation(tmp_path)
+    volume = Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), "nothing")
+    again.logics["Session"]._bring_back(tmp_path, again.session.read_state(tmp_path), {}, volume, None, None, None)
+    assert again.session.ct_to_write() is None
+    assert (tmp_path / "session.json").is_file()
+
+
 def test_a_report_that_differs_from_the_screen_says_why(tmp_path):
     from CranioNavLib import scene
     from CranioNavLib.panel import Level

@@ -85,6 +85,10 @@ class SessionFolder:
         self._ct_image, self._ct_pending, self._state = node.GetImageData(), scene_data.get_volume("CT"), ""
         return self._ct_pending
 
+    def go_on(self, folder: Path) -> None:
+        """The scene's CT was read from this folder: it is not written again, which would take the state away meanwhile."""
+        self.folder, self.goes_on, self._ct_image = folder, True, scene.find("CT").GetImageData()
+
     def _put_earlier_aside(self) -> None:
         """What an earlier session left in the folder, where another one is begun there: it is of another patient."""
         if not (self.folder / STATE_FILE).is_file():

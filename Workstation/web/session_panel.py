@@ -123,8 +123,8 @@ class SessionLogic(ParametersInScene, ScriptedLoadableModuleLogic):
         self, folder: Path, state: dict[str, Any], lists: Any, volume: Any, bone: Any, patient: Any, take: Any
     ) -> str:
         registration, ultrasound = self._logics["ModuleRegistration"], self._logics["ModuleUltrasound"]
-        self.session.folder, self.session.goes_on = folder, True
         registration.takeCt(volume)
+        self.session.go_on(folder)
         if bone is not None:
             registration.takeBone(bone)
         for role, points in lists.items():
