@@ -32,6 +32,7 @@ from Testing.Studies.simulators.disc_plan import (
     draw_statuses,
     wander,
 )
+from Testing.Studies.simulators.echo_powers import echo_powers
 from Testing.Studies.simulators.line_truth import Truth
 
 Floats = npt.NDArray[np.float32]
@@ -89,8 +90,8 @@ class Band:
         lost = 0.2 * NEPER * self.setup.attenuation * depth_mm
         blocks = -(-len(self.mhz) // BLOCK)
         starts = self.mhz[0] + np.arange(blocks) * (BLOCK * self.step_mhz)
-        coarse = _powers(time, lost, starts) * np.where(heard, height, 0.0)[:, :, None].astype(np.float32)
-        fine = _powers(time, lost, np.arange(BLOCK) * self.step_mhz)
+        coarse = echo_powers(time, lost, starts) * np.where(heard, height, 0.0)[:, :, None].astype(np.float32)
+        fine = echo_powers(time, lost, np.arange(BLOCK) * self.step_mhz)
         total = np.matmul(coarse.transpose(0, 2, 1), fine)
         return np.asarray(total.reshape(len(time), -1)[:, : len(self.mhz)])
 
@@ -101,17 +102,6 @@ class Band:
         size = scipy.fft.next_fast_len(3 * thin.shape[1])
         envelope = np.abs(scipy.fft.ifft(thin, size, axis=1)).max(axis=1)
         return np.asarray(envelope * (2 * every * size / self.size), dtype=float)
-
-
-def _powers(time_us: Array, lost: Array, mhz: Array) -> Complex:
-    """exp(-(2 pi i time + lost) mhz) for echoes (n, m) and frequencies (k,)."""
-    turns = time_us[:, :, None] * mhz
-    angle = ((turns - np.rint(turns)) * (-2 * np.pi)).astype(np.float32)
-    height = np.exp((lost[:, :, None] * -mhz).astype(np.float32))
-    powers = np.empty(angle.shape, dtype=np.complex64)
-    powers.real = np.cos(angle) * height
-    powers.imag = np.sin(angle) * height
-    return powers
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,8 @@ from CranioNavLib.recording import Acquisition
 from CranioNavLib.rigid import rigid
 from scipy.signal import lfilter
 
+from Testing.Studies.simulators.units import InMicroseconds
+
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
@@ -47,7 +49,7 @@ NO_DELAY = DelayLine(0.0, 0.0, 0.0, False, 0.0)
 
 
 @dataclass(frozen=True)
-class Setup:
+class Setup(InMicroseconds):
     """What all lines of a recording share. Heights are over bone met squarely at the surface."""
 
     acquisition: Acquisition
@@ -86,14 +88,6 @@ class Setup:
     fill: float  # of the converter, by the typical bone
     bits: int
     left: bool  # codes are moved up to 16 bits
-
-    @property
-    def centre_mhz(self) -> float:
-        return self.acquisition.transducer_hz * 1e-6
-
-    @property
-    def sampling_mhz(self) -> float:
-        return self.acquisition.sampling_hz * 1e-6
 
     @property
     def mm_us(self) -> float:

@@ -14,6 +14,8 @@ import numpy.typing as npt
 from CranioNavLib.recording import Acquisition
 from CranioNavLib.rigid import rigid
 
+from Testing.Studies.simulators.units import InMicroseconds
+
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
@@ -50,7 +52,7 @@ MATERIALS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Setup:
+class Setup(InMicroseconds):
     """What all lines of a recording share."""
 
     acquisition: Acquisition
@@ -72,16 +74,6 @@ class Setup:
     half_deg: float  # the bone's echo has lost 6 dB
     floor: float  # its diffuse echo over its specular one
     speckle: float  # RMS over an echo of height 1
-
-    @property
-    def centre_mhz(self) -> float:
-        """The transducer's frequency."""
-        return self.acquisition.transducer_hz * 1e-6
-
-    @property
-    def sampling_mhz(self) -> float:
-        """Samples a microsecond."""
-        return self.acquisition.sampling_hz * 1e-6
 
     @property
     def mm_us(self) -> float:

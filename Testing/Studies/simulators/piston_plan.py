@@ -17,6 +17,8 @@ from CranioNavLib.recording import Acquisition
 from CranioNavLib.rigid import rigid, rigid_from_vector
 from scipy.signal import lfilter
 
+from Testing.Studies.simulators.units import InMicroseconds
+
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
@@ -38,7 +40,7 @@ LOST = ("MISSING", "OUT_OF_VIEW", "INVALID")
 
 
 @dataclass(frozen=True, eq=False)
-class Setup:
+class Setup(InMicroseconds):
     """What all lines of a recording share."""
 
     acquisition: Acquisition
@@ -64,15 +66,6 @@ class Setup:
     hair: float
     bits: int  # of the converter; more are taken where they would hide the noise
     overdriven: bool  # bone clips
-
-    @property
-    def centre_mhz(self) -> float:
-        return self.acquisition.transducer_hz * 1e-6
-
-    @property
-    def sampling_mhz(self) -> float:
-        """Samples a microsecond."""
-        return self.acquisition.sampling_hz * 1e-6
 
     @property
     def mm_per_us(self) -> float:

@@ -7,6 +7,7 @@ import numpy.typing as npt
 import scipy.fft
 from scipy.special import gamma, j1
 
+from Testing.Studies.simulators.echo_powers import echo_powers
 from Testing.Studies.simulators.piston_plan import Array, Setup
 
 Floats = npt.NDArray[np.float32]
@@ -92,9 +93,9 @@ class Pulse:
         time, high, depth = (np.reshape(one, (len(time_us), -1)) for one in (time_us, height, depth_mm))
         lost = 0.2 * NEPER * self.setup.attenuation * depth
         blocks = -(-len(self.mhz) // BLOCK)
-        coarse = _powers(time, lost, self.mhz[0] + np.arange(blocks) * (BLOCK * self.step_mhz))
+        coarse = echo_powers(time, lost, self.mhz[0] + np.arange(blocks) * (BLOCK * self.step_mhz))
         coarse *= high[:, :, None].astype(np.float32)
-        fine = _powers(time, lost, np.arange(BLOCK) * self.step_mhz)
+        fine = echo_powers(time, lost, np.arange(BLOCK) * self.step_mhz)
         total = np.matmul(coarse.transpose(0, 2, 1), fine)
         return np.asarray(total.reshape(len(time), -1)[:, : len(self.mhz)])
 
@@ -104,14 +105,3 @@ class Pulse:
         full[self.band] = self.spectrum * self.loss(np.array([depth_mm]))[0]
         before, after = (int(length * self.setup.sampling_mhz) + 1 for length in (1.0 + self.rise_us, 1.0 + 6 * self.rise_us))
         return np.roll(scipy.fft.irfft(full, self.size), before)[: before + after], before
-
-
-def _powers(time_us: Array, lost: Array, mhz: Array) -> Complex:
-    """exp(-(2 pi i time + lost) mhz) for echoes (n, m) and frequencies (k,)."""
-    turns = time_us[:, :, None] * mhz
-    angle = ((turns - np.rint(turns)) * (-2 * np.pi)).astype(np.float32)
-    height = np.exp((lost[:, :, None] * -mhz).astype(np.float32))
-    powers = np.empty(angle.shape, dtype=np.complex64)
-    powers.real = np.cos(angle) * height
-    powers.imag = np.sin(angle) * height
-    return powers

@@ -13,6 +13,8 @@ import numpy.typing as npt
 from CranioNavLib.recording import Acquisition
 from CranioNavLib.rigid import rigid
 
+from Testing.Studies.simulators.units import InMicroseconds
+
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 Draws = dict[str, float]
@@ -30,7 +32,7 @@ LEAST_LINES = 8
 
 
 @dataclass(frozen=True, eq=False)
-class World:
+class World(InMicroseconds):
     """What all lines of a recording share. Times in us, frequencies in MHz."""
 
     acquisition: Acquisition
@@ -61,16 +63,6 @@ class World:
     spikes: bool
     hot: bool  # the gain is too high
     bits: int
-
-    @property
-    def centre_mhz(self) -> float:
-        """The transducer's frequency."""
-        return self.acquisition.transducer_hz * 1e-6
-
-    @property
-    def sampling_mhz(self) -> float:
-        """Samples a microsecond."""
-        return self.acquisition.sampling_hz * 1e-6
 
     @property
     def mm_us(self) -> float:

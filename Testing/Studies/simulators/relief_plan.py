@@ -13,6 +13,8 @@ import numpy.typing as npt
 from CranioNavLib.recording import Acquisition
 from CranioNavLib.rigid import rigid
 
+from Testing.Studies.simulators.units import InMicroseconds
+
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
@@ -63,7 +65,7 @@ class DelayLine:
 
 
 @dataclass(frozen=True)
-class Setup:
+class Setup(InMicroseconds):
     """What all lines of a recording share."""
 
     acquisition: Acquisition
@@ -80,14 +82,6 @@ class Setup:
     varies: float  # the places' depths differ by this share
     beam_mm: float  # width of the footprint at half height, both ways
     delay_line: DelayLine | None
-
-    @property
-    def centre_mhz(self) -> float:
-        return self.acquisition.transducer_hz * 1e-6
-
-    @property
-    def sampling_mhz(self) -> float:
-        return self.acquisition.sampling_hz * 1e-6
 
     @property
     def us_mm(self) -> float:

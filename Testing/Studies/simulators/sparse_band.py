@@ -7,6 +7,7 @@ import numpy.typing as npt
 import scipy.fft
 from scipy.special import j1
 
+from Testing.Studies.simulators.echo_powers import echo_powers
 from Testing.Studies.simulators.sparse_plan import Array, Setup
 
 Floats = npt.NDArray[np.float32]
@@ -55,8 +56,8 @@ class Band:
         lost = np.broadcast_to(NEPER * np.asarray(lost_db_mhz), time.shape)
         blocks = -(-len(self.mhz) // BLOCK)
         starts = self.mhz[0] + np.arange(blocks) * (BLOCK * self.step_mhz)
-        coarse = _powers(time, lost, starts) * np.where(heard, height, 0.0)[:, :, None].astype(np.float32)
-        fine = _powers(time, lost, np.arange(BLOCK) * self.step_mhz)
+        coarse = echo_powers(time, lost, starts) * np.where(heard, height, 0.0)[:, :, None].astype(np.float32)
+        fine = echo_powers(time, lost, np.arange(BLOCK) * self.step_mhz)
         total = np.matmul(coarse.transpose(0, 2, 1), fine)
         return np.asarray(total.reshape(len(time), -1)[:, : len(self.mhz)])
 
@@ -94,14 +95,3 @@ def pulse_spectrum(setup: Setup, size: int) -> Complex:
     low = 1 + (0.25 * setup.centre_mhz / np.maximum(mhz, 1e-6)) ** 6
     high = 1 + (mhz / (0.47 * setup.sampling_mhz)) ** 16
     return np.asarray(scipy.fft.rfft(scipy.fft.ifftshift(pulse)) / (low * high), dtype=np.complex64)
-
-
-def _powers(time_us: Array, lost: Array, mhz: Array) -> Complex:
-    """exp(-(2 pi i time + lost) mhz) for echoes (n, m) and frequencies (k,)."""
-    turns = time_us[:, :, None] * mhz
-    angle = ((turns - np.rint(turns)) * (-2 * np.pi)).astype(np.float32)
-    height = np.exp((lost[:, :, None] * -mhz).astype(np.float32))
-    powers = np.empty(angle.shape, dtype=np.complex64)
-    powers.real = np.cos(angle) * height
-    powers.imag = np.sin(angle) * height
-    return powers

@@ -15,6 +15,8 @@ from CranioNavLib.recording import Acquisition
 from CranioNavLib.rigid import rigid
 from scipy.signal import lfilter
 
+from Testing.Studies.simulators.units import InMicroseconds
+
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
@@ -52,7 +54,7 @@ NO_DELAY = DelayLine(0.0, 1.0, 0.0, 0.0, False)
 
 
 @dataclass(frozen=True)
-class Setup:
+class Setup(InMicroseconds):
     """What all lines of a recording share. Heights are over a total reflection at the face."""
 
     acquisition: Acquisition
@@ -76,14 +78,6 @@ class Setup:
     spikes: bool
     loses_probe: bool
     bits: int  # of the converter, unless its noise is too small for them
-
-    @property
-    def centre_mhz(self) -> float:
-        return self.acquisition.transducer_hz * 1e-6
-
-    @property
-    def sampling_mhz(self) -> float:
-        return self.acquisition.sampling_hz * 1e-6
 
     @property
     def us_mm(self) -> float:

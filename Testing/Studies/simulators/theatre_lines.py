@@ -16,6 +16,7 @@ import numpy.typing as npt
 import scipy.fft
 from CranioNavLib.recording import Recording
 
+from Testing.Studies.simulators.echo_powers import echo_powers
 from Testing.Studies.simulators.line_truth import Truth
 from Testing.Studies.simulators.theatre_plan import Array, Bools, Hand, Theatre, draw_hand, draw_poses, draw_status, draw_theatre
 
@@ -68,8 +69,8 @@ class Pulse:
         lost = 0.2 * NEPER * self.theatre.attenuation * path_mm
         blocks = -(-len(self.mhz) // BLOCK)
         starts = self.mhz[0] + np.arange(blocks) * (BLOCK * self.step_mhz)
-        coarse = _powers(time_us, lost, starts) * height[:, :, None].astype(np.float32)
-        fine = _powers(time_us, lost, np.asarray(np.arange(BLOCK) * self.step_mhz, dtype=float))
+        coarse = echo_powers(time_us, lost, starts) * height[:, :, None].astype(np.float32)
+        fine = echo_powers(time_us, lost, np.asarray(np.arange(BLOCK) * self.step_mhz, dtype=float))
         total = np.matmul(coarse.transpose(0, 2, 1), fine)
         return np.asarray(total.reshape(len(time_us), -1)[:, : len(self.mhz)])
 
@@ -81,17 +82,6 @@ class Pulse:
         size = scipy.fft.next_fast_len(4 * spectra.shape[1])
         envelope = np.abs(scipy.fft.ifft(spectra, size, axis=1)).max(axis=1)
         return np.asarray(envelope * (height * (size * every / self.size)), dtype=float)
-
-
-def _powers(time_us: Array, lost: Array, mhz: Array) -> Complex:
-    """exp(-(2 pi i time + lost) mhz) for echoes (n, m) and frequencies (k,)."""
-    turns = time_us[:, :, None] * mhz
-    angle = ((turns - np.rint(turns)) * (-2 * np.pi)).astype(np.float32)
-    height = np.exp((lost[:, :, None] * -mhz).astype(np.float32))
-    powers = np.empty(angle.shape, dtype=np.complex64)
-    powers.real = np.cos(angle) * height
-    powers.imag = np.sin(angle) * height
-    return powers
 
 
 class Echoes:
