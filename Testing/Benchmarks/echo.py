@@ -3,7 +3,7 @@
     python -m Testing.Benchmarks.echo --worlds 300 --seed 7
 
 The recordings are drawn like those of the calibration, from each of its families (Testing/Studies/simulators), with other
-seeds, and from families that no network is fitted to (plain_lines, grid_lines, kirchhoff_lines; other recordings of them
+seeds, and from families that no network is fitted to (plain_lines, latency_lines; other recordings of them
 calibrate the stated quality). Depths are judged with the true speed of sound given.
 """
 

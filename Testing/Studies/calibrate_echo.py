@@ -3,11 +3,11 @@
     python -m Testing.Studies.calibrate_echo --worlds 4400 --seed 30 [--cache DIR]
 
 The recordings come from families of simulated lines that share no model (Testing/Studies/simulators). Four are drawn to be hard,
-one is a water bath, where there is bone and nothing else, and six go as a palpation session does: the hand comes down, searches
-the perpendicular, holds, lifts. Each recording has its own pulse, transducer, forerun, tissue, noise and clutter. A tenth of
-the recordings is kept out of the fit; they judge it, and on them and on families that nothing is fitted to (UNSEEN) the stated
-quality is mapped to the share of depths that were right. The same seed gives the same table; the one in the repository says in
-its note what it was fitted to.
+one is a water bath, where there is bone and nothing else, and fourteen go as a palpation session does: the hand comes down,
+searches the perpendicular, holds, lifts. Each recording has its own pulse, transducer, forerun, tissue, noise and clutter. A
+tenth of the recordings is kept out of the fit; they judge it, and on them and on families that nothing is fitted to (UNSEEN)
+the stated quality is mapped to the share of depths that were right. The same seed gives the same table; the one in the
+repository says in its note what it was fitted to.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from CranioNavLib.recording import Recording
 from ModuleUltrasoundLib.echo.likelihood import shared_features
 from ModuleUltrasoundLib.echo.network import WEIGHTS, Likelihood, Network, probabilities, write_likelihood
 from ModuleUltrasoundLib.echo.search import Found, search_lines
-from ModuleUltrasoundLib.measurement.measure import EchoSettings, measure_lines, places_of, stays
+from ModuleUltrasoundLib.measurement.measure import DEFAULT_SETTINGS, EchoSettings, measure_lines, places_of, stays
 from ModuleUltrasoundLib.measurement.quality import TOLERANCE_MM
 
 from Testing.Studies.fit_network import Lines, fit, joined
@@ -34,10 +34,12 @@ from Testing.Studies.simulators import bench_lines, echo_lines, tissue_lines
 from Testing.Studies.simulators.families import HARD, SESSIONS, UNSEEN
 
 Array = npt.NDArray[np.float64]
-# Recordings of each family, of the number asked for: in a water bath there is less to learn, and exact physics takes its time
-FAMILIES = {"echo_lines": 1.0, "tissue_lines": 1.0, "bench_lines": 1.0, "bare_lines": 0.25, "page_lines": 1.0} | {
-    name: 1.0 if name == "session_lines" else 0.25 for name in SESSIONS
-}
+# Recordings of each family, of the number asked for
+FAMILIES = (
+    dict.fromkeys(HARD, 0.75)
+    | {"bare_lines": 0.5, "session_lines": 1.0}
+    | dict.fromkeys(sorted(SESSIONS.keys() - {"session_lines"}), 0.5)
+)
 TURNS = 2  # networks: a line by itself, then with the recording around it; a third adds little and costs a tenth of the time
 LABEL_MM = 0.4  # a candidate this near to the bone stands for it
 LATE_CYCLES = 1.2  # without a forerun echo the peak of a pulse that rises at its arrival comes later; corrected afterwards
@@ -92,11 +94,12 @@ def simulate_world(family: str, seed: int) -> Simulated:
 def search_world(one: Simulated) -> World:
     """Search a recording and label its candidates: the strongest near the bone stands for it."""
     runs = stays(one.recording)
-    found = search_lines(one.recording, one.assumed_m_s, (1.4, 20.0), places_of(one.recording, runs))
+    limits = (DEFAULT_SETTINGS.least_depth_mm, DEFAULT_SETTINGS.most_depth_mm)
+    found = search_lines(one.recording, one.assumed_m_s, limits, places_of(one.recording, runs))
     off = found.depths_mm - one.true_mm[:, None] * one.assumed_m_s / one.speed_m_s
     late = LATE_CYCLES / one.recording.acquisition.transducer_hz * 500 * one.assumed_m_s
     late_mm = np.where(found.forerun.measured, 0.0, late)[:, None]
-    near = np.isfinite(off) & (off > -LABEL_MM) & (off < LABEL_MM + late_mm)
+    near = found.possible & (off > -LABEL_MM) & (off < LABEL_MM + late_mm)
     level = np.where(near, found.candidates.snrs_db, -np.inf)
     found = replace(found, windows=found.windows[:, :0], features=found.features.astype(np.float32))  # what is not used
     return World(found, np.where(near.any(axis=1), level.argmax(axis=1), off.shape[1]), runs)
@@ -126,7 +129,7 @@ def lines_of(worlds: list[World], features: list[Array], rng: np.random.Generato
     some = [rng.permutation(len(world.labels))[:LINES_EACH] for world in worlds]
     return Lines(
         np.concatenate([one[index] for one, index in zip(features, some)]).astype(np.float32),
-        np.concatenate([np.isfinite(world.found.depths_mm)[index] for world, index in zip(worlds, some)]),
+        np.concatenate([world.found.possible[index] for world, index in zip(worlds, some)]),
         np.concatenate([world.labels[index] for world, index in zip(worlds, some)]),
         np.repeat(np.arange(len(worlds)), [len(index) for index in some]),
     )
@@ -244,7 +247,7 @@ def judge(turn: int, networks: tuple[Network, ...], held: list[Simulated], tests
             if one.family != family:
                 continue
             features = seen_by(world, list(networks[:turn])) if turn else world.found.features
-            chance, rest = probabilities(networks[turn].scores(features), np.isfinite(world.found.depths_mm))
+            chance, rest = probabilities(networks[turn].scores(features), world.found.possible)
             both = np.concatenate([chance, rest[:, None]], axis=1)
             rows = np.arange(len(both))
             loss -= float(np.log(both[rows, world.labels] + 1e-9).sum())

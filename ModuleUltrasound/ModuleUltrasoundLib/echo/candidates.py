@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.rigid import Array
 
-from ModuleUltrasoundLib.echo.lean import at_samples, clip, median
+from ModuleUltrasoundLib.echo.lean import at_samples, clip, median, without_nan
 from ModuleUltrasoundLib.echo.signal_chain import Envelopes, Floats
 
 CANDIDATES = 8  # echoes kept of a line
@@ -47,6 +47,8 @@ class Candidates:
     rise_db: Array  # (n, K) the echo over the level at its own front foot
     fall_db: Array  # (n, K) the echo over the level at its own rear foot: a lasting pulse or a lump of echoes falls slowly
     end_db: Array  # (n, K) level of the line's end over its quietest stretch: a receiver may amplify with depth
+    half_db: Array  # (n, K) envelope at half the echo's delay, over the echo: strong where a thin film sends sound to and fro
+    further_db: Array  # (n, K) the same at one and a half times the delay
     static: Array  # (n, K) 0 to 1: how far it is an echo of the probe, the same at all places
     noise: Array  # (n,) standard deviation of one quadrature
 
@@ -260,9 +262,18 @@ def _describe(
         before_all_db=under[2].T,
         after_all_db=under[3].T,
         end_db=under[4].T,
+        half_db=_over(magnitude, skin_s, times, heights, 0.5, rate),
+        further_db=_over(magnitude, skin_s, times, heights, 1.5, rate),
         static=np.zeros(samples.shape),
         noise=noise,
     )
+
+
+def _over(magnitude: Floats, skin_s: Array, times_s: Array, heights: Array, share: float, rate_hz: float) -> Array:
+    """Level (n, K) of the envelope at `share` of the delay of echoes at `times_s` (K, n), in dB over their `heights` (K, n)."""
+    at = np.rint(without_nan((skin_s + share * (times_s - skin_s)) * rate_hz, -1.0)).astype(np.int64)
+    there = at_samples(magnitude, clip(at + _STEPS, 0, magnitude.shape[1] - 1)).max(axis=0)
+    return np.asarray((DECIBEL * np.log(np.maximum(there, np.float32(1e-3)) / heights)).T)
 
 
 def _surroundings(

@@ -30,6 +30,7 @@ UNITS = {  # what each number is counted in, so that all are of order one
     "multiple": 1, "multiple share": 15, "forerun": 30, "has forerun": 1, "reverberation": 15, "width": 1,
     "rank before": 3, "rank behind": 3, "line snr": 20, "next best": 15, "frequency": 0.2, "frequency against before": 0.2,
     "frequency against behind": 0.2, "rise": 15, "fall": 15, "end of line": 15, "own reverberation": 15, "static": 0.5,
+    "half": 15, "further": 15,
 }  # fmt: skip
 NAMES = tuple(UNITS)
 _DIVISORS = np.array(list(UNITS.values()), dtype=np.float32)[:, None, None]
@@ -43,7 +44,7 @@ def line_features(
     Inside, the lines are the last axis: numpy's inner loops then run over many lines instead of a few candidates.
     """
     valid = ~np.isnan(candidates.amplitudes.T)
-    delays, amplitudes, frequencies, widths, saliences, rise, fall, end, static, *stretches = _numbers(candidates)
+    delays, amplitudes, frequencies, widths, saliences, rise, fall, end, static, half, further, *stretches = _numbers(candidates)
     level = DECIBEL * np.log(np.maximum(amplitudes, np.float32(1e-9)))
     snr = np.where(valid, level - (DECIBEL * np.log(candidates.noise)).astype(np.float32), np.float32(-FAR_DB))
     depth = delays * np.float32(500 * speed_m_s)
@@ -65,7 +66,7 @@ def line_features(
         stronger[0], far[0], stronger[1], far[1], depth, depth * np.float32(transducer_hz * 1e-6),
         multiple, over * multiple, over, forerun.amplitude > 0, reverberation, widths * np.float32(transducer_hz),
         rank[0], rank[1], np.minimum(strongest, CLEAR_DB), strongest - snr,
-        frequency, lower[0], lower[1], rise, fall, end, own, static,
+        frequency, lower[0], lower[1], rise, fall, end, own, static, half, further,
     )  # fmt: skip
     stacked = np.empty((len(NAMES), *snr.shape), dtype=np.float32)
     for row, feature in zip(stacked, features):
@@ -80,6 +81,7 @@ def _numbers(candidates: Candidates) -> Floats:
     """What the features are made of, each (K, n); 0 where there is no candidate or the stretch is empty."""
     names = (
         "delays_s", "amplitudes", "frequencies_hz", "widths_s", "saliences_db", "rise_db", "fall_db", "end_db", "static",
+        "half_db", "further_db",
         "before_db", "after_db", "before_all_db", "after_all_db",
     )  # fmt: skip
     numbers = np.empty((len(names), *candidates.amplitudes.T.shape), dtype=np.float32)
@@ -118,8 +120,10 @@ def _multiples(
     if nominal_skin_s <= 0:
         return np.zeros(delays.shape, dtype=np.float32)
     times = np.arange(1, MULTIPLES, dtype=np.float32)[:, None, None]
-    late = delays - times * forerun.skin_s.astype(np.float32)
-    off = np.maximum(late, -late - times * np.float32(MULTIPLE_EARLY_CYCLES / transducer_hz)).min(axis=0)
+    expected = times * forerun.skin_s.astype(np.float32)
+    early = times * np.float32(MULTIPLE_EARLY_CYCLES / transducer_hz)
+    jump = forerun.jump_s.astype(np.float32)
+    off = np.minimum(*(np.maximum(late, -late - early).min(axis=0) for late in (delays - expected, delays - jump - expected)))
     off = np.maximum(off, 0) / np.float32(MULTIPLE_TOLERANCE_S)
     return np.asarray(np.exp(-(off**2)) * valid)
 

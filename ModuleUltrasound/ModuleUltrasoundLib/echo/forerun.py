@@ -48,6 +48,7 @@ class Forerun:
     found: npt.NDArray[np.bool_]  # (n,) the echo was seen in this line
     measured: npt.NDArray[np.bool_]  # (n,) the time comes from this line's echo or its neighbours', not from the header
     sd_s: Array  # (n,) of the skin's time, as far as noise makes it uncertain
+    jump_s: Array  # (n,) by which the whole line comes late, where a clear face stands elsewhere than in the other lines; else 0
     face: Array  # (n,) highest envelope where the face should be, of whatever it is an echo; 0 without a forerun
 
 
@@ -69,7 +70,7 @@ def find_forerun(envelopes: Envelopes, magnitude: npt.NDArray[np.float32], noise
     count, length = magnitude.shape
     false = np.zeros(count, dtype=bool)
     none = np.zeros(count)
-    nothing = Forerun(np.full(count, nominal), none, false, false, none, none)
+    nothing = Forerun(np.full(count, nominal), none, false, false, none, none, none)
     rate = envelopes.rate_hz
     first = max(int((nominal * (1 - SEARCH) - SEARCH_S / 2) * rate), 1)
     last = min(int((nominal * (1 + SEARCH) + SEARCH_S) * rate) + 1, length - 1)
@@ -92,15 +93,16 @@ def find_forerun(envelopes: Envelopes, magnitude: npt.NDArray[np.float32], noise
     found = inside & (heights > LEAST_SNR * noise) & (heights > np.where(expected, CONTRAST_EXPECTED, CONTRAST) * behind)
     if not found.any():
         return nothing
-    clear = found & (heights > CLEAR * behind)
-    found &= np.abs(times - median(times[found])) < SAME_S
+    seen, clear = found, found & (heights > CLEAR * behind)
+    found = found & (np.abs(times - median(times[found])) < SAME_S)
     if found.sum() < LEAST_SHARE * count:
         found = _agreeing(times, clear, nominal)
     if not found.any():
         return nothing
     middle = median(times[found])
     sd = np.where(found, widths / rate * noise / np.maximum(heights, 1e-9), SAME_S / 2)
-    return Forerun(np.where(found, times, middle), np.where(found, heights, 0.0), found, ~false, sd, heights)
+    jump = np.where(seen & ~found, times - middle, 0.0)
+    return Forerun(np.where(found, times, middle), np.where(found, heights, 0.0), found, ~false, sd, jump, heights)
 
 
 def _agreeing(times: Array, clear: npt.NDArray[np.bool_], nominal_s: float) -> npt.NDArray[np.bool_]:

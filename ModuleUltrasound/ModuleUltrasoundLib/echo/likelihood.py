@@ -26,6 +26,8 @@ BIN_MM = 0.2
 REACH = 4  # neighbouring lines on each side
 FAR_REACH = 20  # the same, of a long stay or a slow glide
 SAME_FAR_MM = 0.6  # the bone's depth wanders over so many
+BEHIND_BINS = 5  # an echo so far behind another is another interface
+LEAST_AT_PLACE = 0.05  # of the lines from a place: a smaller share is chance
 BLUR_STEP = 64  # bins: maps are of many sizes, matrices for them of a few
 USUAL_MM = 1.2  # the scalp of a head is about as thick from place to place
 SURE = 0.85
@@ -60,6 +62,7 @@ SHARED_NAMES = (
     "sure in all",
     "support in all",
     "strength spread",
+    "covered",
 )
 
 
@@ -88,7 +91,7 @@ def _judge_together(found: Found, likelihood: Likelihood, runs: npt.NDArray[np.i
         if turn:
             shared = shared_features(found, scores, runs, echoes)
         scores = network.scores(np.concatenate([found.features, shared], axis=-1))
-    chance, _ = probabilities(scores, np.isfinite(found.depths_mm))
+    chance, _ = probabilities(scores, found.possible)
     return chance, shared
 
 
@@ -103,7 +106,7 @@ def shared_features(found: Found, scores: Array, runs: npt.NDArray[np.int64], ec
     if not valid.size:
         return np.zeros((*valid.shape, len(SHARED_NAMES)), dtype=np.float32)
     echoes = echoes or Echoes.of(depth_mm, runs)
-    chance, none = probabilities(scores, valid)
+    chance, none = probabilities(scores, found.possible)
     strength, strength_known, slope = relative_strength(candidates, chance, depth_mm)
     polarity, polarity_known = relative_polarity(candidates.phases - found.forerun_phases[:, None], chance)
     near, far = Neighbours.within(runs, REACH), Neighbours.within(runs, FAR_REACH)
@@ -135,6 +138,7 @@ def shared_features(found: Found, scores: Array, runs: npt.NDArray[np.int64], ec
         "clear in all": top.mean(),
         "sure in all": (top > SURE).mean(),
         "support in all": (top * support[rows, best]).sum() / max(top.sum(), 1e-6),
+        "covered": echoes.covered(likely),
         "strength spread": np.sqrt((top * strength[rows, best] ** 2).sum() / max(top.sum(), 1e-6)),
     }
     stacked = np.zeros((*valid.shape, len(SHARED_NAMES)), dtype=np.float32)
@@ -246,6 +250,9 @@ class Echoes:
     presence: Array  # (n, K) share of the neighbours with an echo at this depth
     elsewhere: Array  # (n, K) share of the lines from other places with one
     elsewhere_known: Array  # (n, 1) 0 to 1: enough of them
+    at_place: Array  # (n, K) share of the other lines from the same place with an echo at this depth
+    here: DepthMap
+    place: Neighbours
 
     @classmethod
     def of(cls, depth_mm: Array, runs: npt.NDArray[np.int64]) -> Echoes:
@@ -260,7 +267,21 @@ class Echoes:
             near,
             np.clip(elsewhere / np.maximum(others, 1), 0, 2),
             np.minimum(others / 10, 1),
+            of_own,
+            here,
+            own,
         )
+
+    def covered(self, likely: DepthMap) -> Array:
+        """Of the lines from the same place that show an echo at a candidate's depth, the share (n, K) with the bone behind it.
+
+        Nothing is seen behind bone: what goes on over a hole in the skull is a layer of the scalp. `likely` maps where the
+        bone is.
+        """
+        deeper = np.zeros_like(likely.values)
+        deeper[:, :-BEHIND_BINS] = np.cumsum(likely.values[:, ::-1], axis=1)[:, -BEHIND_BINS - 1 :: -1]
+        behind = DepthMap(likely.bins, self.here.values * deeper).mean(self.place, SAME_MM)
+        return behind / (self.at_place + LEAST_AT_PLACE)
 
 
 def relative_strength(candidates: Candidates, chance: Array, depth_mm: Array) -> tuple[Array, float, float]:

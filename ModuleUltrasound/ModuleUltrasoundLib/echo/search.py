@@ -23,6 +23,7 @@ from ModuleUltrasoundLib.echo.timing import BEFORE, BEHIND, Complexes
 BANG_SAMPLES = 40  # ten cycles
 KEPT = 3  # candidates of a line whose echo is kept sample by sample
 CHUNK = 512  # lines worked on at once: enough to spread the cost of a step, few enough for the processor's last cache
+SEEN_MM = (0.4, 4.0)  # beyond the least and the most depth of bone: echoes there are no bone, and tell of what is
 BEHIND_S = 4e-6  # of a line kept behind the deepest bone: what follows an echo speaks for or against it
 
 
@@ -36,6 +37,7 @@ class Found:
     features: Array  # (n, K, D)
     scores: Array  # (n, K) of `rank`; 0 without it
     depths_mm: Array  # (n, K) at the speed of sound given
+    possible: npt.NDArray[np.bool_]  # (n, K) where bone is looked for
     windows: Complexes  # (n, KEPT, W) complex envelope around the first candidates, for the time of flight
     bang: npt.NDArray[np.complex128]  # mean complex envelope of the lines' first samples
     rate_hz: float
@@ -52,6 +54,7 @@ class Found:
             features=self.features[rows],
             scores=self.scores[rows],
             depths_mm=self.depths_mm[rows],
+            possible=self.possible[rows],
             windows=self.windows[rows],
         )
 
@@ -82,9 +85,14 @@ class Search:
 
     acquisition: Acquisition
     speed_m_s: float
-    window_s: tuple[float, float]  # (least, most) behind the skin
+    bone_s: tuple[float, float]  # (least, most) behind the skin where bone is looked for
+    window_s: tuple[float, float]  # the same where echoes are
     band: Band
     rank: Optional[Rank]
+
+    def possible(self, delays_s: Array) -> npt.NDArray[np.bool_]:
+        """Whether echoes at these delays may be bone; not where there is no echo."""
+        return np.asarray((delays_s >= self.bone_s[0]) & (delays_s <= self.bone_s[1]))
 
 
 def search_lines(
@@ -109,9 +117,10 @@ def search_lines(
     if len(recording) and not recording.lines.shape[1]:
         raise InputError("the recording holds no RF samples, only poses; record the A-lines with them (DimSize = N 1 F)")
     per_s = 500.0 * speed_m_s  # mm of depth a second of delay
-    window = (depth_mm[0] / per_s, depth_mm[1] / per_s)
+    bone = (depth_mm[0] / per_s, depth_mm[1] / per_s)
+    window = (max(depth_mm[0] - SEEN_MM[0], 0.0) / per_s, (depth_mm[1] + SEEN_MM[1]) / per_s)
     band = design_band(acquisition, recording.lines.shape[1], nominal_skin_s(acquisition) * 1.04 + window[1] + BEHIND_S)
-    search = Search(acquisition, speed_m_s, window, band, rank)
+    search = Search(acquisition, speed_m_s, bone, window, band, rank)
     batches = max(-(-len(recording) // CHUNK), 1)
     parts = np.array_split(recording.lines, batches) if batches > 1 else [recording.lines]
     of_parts = [None] * batches if places is None else np.array_split(places, batches)
@@ -131,6 +140,7 @@ def search_lines(
         _joined(found, "features"),
         _joined(found, "scores"),
         candidates.delays_s * per_s,
+        search.possible(candidates.delays_s),
         _joined(found, "windows"),
         np.asarray(bang, dtype=np.complex128),
         band.rate_hz,
@@ -166,7 +176,7 @@ def _search_batch(lines: npt.NDArray[np.int16], places: npt.NDArray[np.int64] | 
     features = line_features(candidates, forerun, skin, acquisition.transducer_hz, search.speed_m_s)
     scores = np.zeros(features.shape[:2]) if rank is None else rank(features)
     if rank is not None:
-        order = np.argsort(-np.where(np.isfinite(candidates.delays_s), scores, -np.inf), axis=1, kind="stable")
+        order = np.argsort(-np.where(search.possible(candidates.delays_s), scores, -np.inf), axis=1, kind="stable")
         candidates, scores, features = reorder(candidates, order), pick(scores, order), pick(features, order)
     return Found(
         candidates,
@@ -175,6 +185,7 @@ def _search_batch(lines: npt.NDArray[np.int16], places: npt.NDArray[np.int64] | 
         features,
         scores,
         candidates.delays_s * 500.0 * search.speed_m_s,
+        search.possible(candidates.delays_s),
         _cut_windows(envelopes, candidates.delays_s[:, :KEPT] + forerun.skin_s[:, None]),
         bang,
         envelopes.rate_hz,

@@ -21,7 +21,7 @@ STRONG_FORERUN_DB = 5.0  # over the recording's median: nothing takes sound out 
 # The forerun's face sends all back in air, and 0.05 to 0.3 of it with skin and gel behind: 10 to 26 dB less
 IN_AIR_DB = 12.0  # of the face's echo over that of the lines that see bone
 LIFTED_DB = 4.0  # the same, where the echo lies where the face's echo would repeat
-LEAST_IN_CONTACT = 3  # lines
+LEAST_IN_CONTACT, HARDLY = 3, 0.2  # lines, and share of the good ones
 TILTED_DB = 9.0  # a bone echo weaker than this under the recording's others: a tilt of several degrees
 FAINT_DB = 13.0  # weaker than this it is no point, however sure: a layer that does not fade may have been followed instead
 LIKELY = 0.3
@@ -112,7 +112,7 @@ def lost_contact(face: Array, multiple: Array, good: Bools) -> Bools:
     in which bone would be seen nowhere else than where the face's echo repeats has not been in contact.
     """
     known = good & (multiple < REPEATED) & (face > 0)
-    if known.sum() < LEAST_IN_CONTACT:  # nothing shows that sound gets into the head at all
+    if known.sum() < max(LEAST_IN_CONTACT, HARDLY * good.sum()):  # nothing shows that sound gets into the head at all
         return good & (multiple > REPEATED)
     over_db = 20 * np.log10(np.maximum(face, 1e-9) / median(face[known]))
     return np.asarray((over_db > IN_AIR_DB) | ((over_db > LIFTED_DB) & (multiple > REPEATED)))

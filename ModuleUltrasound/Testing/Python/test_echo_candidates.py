@@ -83,3 +83,17 @@ def test_window_outside_of_the_line_gives_no_candidates():
     found = find_candidates(envelopes, magnitude, np.full(3, 1e-5), (1e-6, 2e-5), 5e6)
     assert found.delays_s.shape == (3, CANDIDATES)
     assert np.isnan(found.delays_s).all()
+
+
+def test_second_rung_of_a_ladder_of_echoes_has_others_at_half_its_delay_and_at_one_and_a_half():
+    ladder = sum(bump(100 + rung * 30, 400.0 / rung) for rung in (1, 2, 3))
+    for magnitude, over in ((ladder, 20 * np.log10(2.0)), (ladder - bump(130, 400.0), None)):
+        lines = (magnitude + 1.0).astype(np.float32)[None]
+        envelopes = Envelopes(lines.astype(np.complex64), RATE, 5e6)
+        found = find_candidates(envelopes, lines, np.array([100 / RATE]), (40 / RATE, 600 / RATE), 5e6)
+        second = np.nanargmin(np.abs(found.delays_s[0] * RATE - 60))
+        assert found.further_db[0, second] == pytest.approx(20 * np.log10(2 / 3), abs=0.2)
+        if over is None:
+            assert found.half_db[0, second] < -30
+        else:
+            assert found.half_db[0, second] == pytest.approx(over, abs=0.2)

@@ -49,3 +49,14 @@ def test_forerun_echo_in_air_stands_out_of_the_recording():
     assert level[3] == pytest.approx(np.log10(5) * 2)
     assert level[:3] == pytest.approx(np.zeros(3))
     assert level[4] == 0
+
+
+def test_layer_that_also_shows_where_bone_lies_behind_it_is_covered_and_bone_is_not():
+    depth = np.array([[2.0, 6.0]] * 10 + [[2.0, np.nan]] * 4)
+    chance = np.where(np.isnan(depth), 0.0, [0.05, 0.9])
+    runs = np.zeros(14, dtype=int)
+    covered = Echoes.of(depth, runs).covered(DepthMap.of(chance, depth))
+    assert covered[-4:, 0] == pytest.approx(np.full(4, 0.9 * 10 / 13 / 1.05), rel=0.05)
+    assert np.nanmax(covered[:10, 1]) == 0
+    alone = Echoes.of(depth, np.arange(14)).covered(DepthMap.of(chance, depth))
+    assert alone.max() < 1e-4, "other places say nothing about this one's layers"

@@ -39,7 +39,7 @@ def test_batches_do_not_change_what_is_found(a_recording, monkeypatch):
 def test_candidates_stand_in_the_order_of_their_rank(a_recording):
     found = search_lines(a_recording, 1540.0, (1.4, 20.0), None, rank=lambda features: features[..., 0])
     snr = found.candidates.snrs_db
-    assert (np.diff(np.nan_to_num(snr, nan=-99), axis=1) <= 1e-6).all()
+    assert (np.diff(np.where(found.possible, snr, -99), axis=1) <= 1e-6).all()
     assert found.features[..., 0][:, 0] * 20 == pytest.approx(np.minimum(snr[:, 0], CLEAR_DB), abs=1e-3)
 
 
@@ -80,3 +80,13 @@ def test_hum_that_the_line_cuts_off_leaves_no_echo_at_its_end(a_recording):
 def test_depth_is_half_the_way_of_the_sound(a_recording):
     slow = search_lines(a_recording, 1500.0, (1.4, 20.0), None)
     assert slow.depths_mm == pytest.approx(slow.candidates.delays_s * 750e3, nan_ok=True)
+
+
+def test_echoes_beyond_the_depths_of_bone_are_seen_and_are_no_bone(a_recording):
+    found = search_lines(a_recording, 1540.0, (4.0, 9.0), None, rank=lambda features: features[..., 0])
+    seen = found.depths_mm[np.isfinite(found.depths_mm)]
+    assert seen.min() > 3.5
+    assert 9.5 < seen.max() < 13.1
+    np.testing.assert_array_equal(found.possible, (found.depths_mm >= 4.0) & (found.depths_mm <= 9.0))
+    first_impossible = np.where(found.possible.all(axis=1), found.possible.shape[1], found.possible.argmin(axis=1))
+    assert (found.possible.sum(axis=1) == first_impossible).all(), "what may be bone comes first"

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import hilbert
+from scipy.signal import find_peaks, hilbert
 
 from Testing.Benchmarks.echo import calibration, measure_world, rates
 from Testing.Studies.simulators import session_lines
@@ -93,6 +93,25 @@ def test_probe_in_air_answers_from_its_face_alone():
     silent = air.lines[:, first:last].astype(float).std()
     assert np.abs(air.lines[:, first:last]).max() < 6 * silent
     assert np.abs(air.lines[:, :first]).max() > 20 * silent
+
+
+def test_film_of_gel_with_air_behind_answers_with_a_ladder_of_equal_steps():
+    plain = {"glides": False, "static": (), "trail": (), "hum": 0.0, "drift": 0.0, "spikes": 0.0, "bits": 14, "fill": 0.5}
+    drawn = (session_lines.draw_session(np.random.default_rng(seed)) for seed in range(100))
+    # rungs must be apart: high frequency, and nothing of the main bang over them
+    session = next(one for one in drawn if one.acquisition.forerun_length_mm > 20 and one.centre_mhz > 6 and one.pulse == "gauss")
+    film, truth, _ = session_lines.simulate(np.random.default_rng(3), 12, replace(session, without="film", snr_db=38.0, **plain))
+    assert np.isnan(truth.depth_mm).all()
+    acquisition = film.acquisition
+    line = film.lines[len(film) // 2].astype(float)
+    level = np.abs(hilbert(line - line.mean()))
+    per_mm = 2e3 / truth.speed_m_s * acquisition.sampling_hz * 1e-6
+    skin = 2e3 * acquisition.forerun_length_mm / acquisition.forerun_speed_m_s * session.late * acquisition.sampling_hz * 1e-6
+    peaks, _ = find_peaks(level, height=8 * np.median(level), distance=int(0.3 * per_mm))
+    rungs = (peaks[peaks > skin - 0.1 * per_mm] - skin) / per_mm
+    assert len(rungs) >= 3
+    assert np.diff(rungs[:3]) == pytest.approx(np.full(2, rungs[1] - rungs[0]), abs=0.06)
+    assert 0.35 < rungs[1] - rungs[0] < 1.8
 
 
 def test_depth_is_continuous_within_a_place_and_places_are_apart(some_sessions):

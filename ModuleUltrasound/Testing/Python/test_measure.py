@@ -136,6 +136,20 @@ def test_second_echo_of_a_face_in_air_is_no_bone_where_a_matched_face_shows_none
     assert found.accepted[contact].mean() > 0.9
 
 
+def test_bone_is_only_looked_for_between_the_depths_that_are_set():
+    rng = np.random.default_rng(6)
+    depths = np.where(np.arange(40) % 2 == 0, 5.0, 9.0) + rng.normal(0, 0.05, 40)
+    recording = record(rng, depths, SET_UPS["5 MHz, polystyrene"])
+    deep = depths > 7
+    whole = measure_lines(recording, EchoSettings(speed_of_sound_m_s=SPEED))
+    assert whole.accepted.mean() > 0.9
+    cut = measure_lines(recording, EchoSettings(speed_of_sound_m_s=SPEED, most_depth_mm=7.0))
+    assert cut.accepted[~deep].mean() > 0.9
+    assert not (cut.accepted & deep).any()
+    assert not (cut.depths_mm > 7.1).any()
+    assert set(np.array(cut.reasons)[deep]) <= {"no echo", "unstable", "tilt too large"}
+
+
 def test_depth_scales_with_the_speed_of_sound():
     rng = np.random.default_rng(4)
     recording = record(rng, rng.uniform(4, 12, 20), SET_UPS["5 MHz, polystyrene"])

@@ -110,3 +110,9 @@ def test_echoes_side_by_side_count_together_when_the_bone_is_chosen():
     depth = np.array([[3.1, 9.0, 3.3, 3.4], [3.1, 9.0, 6.0, np.nan]])
     chance = np.array([[0.2, 0.35, 0.25, 0.15], [0.3, 0.35, 0.2, 0.0]])
     assert choose(depth, chance).tolist() == [2, 1]
+
+
+def test_few_lines_of_a_trigger_that_jumps_show_no_contact():
+    again = np.concatenate([np.ones(36), np.zeros(4)])
+    lifted = lost_contact(np.full(40, 3.0), again, np.ones(40, dtype=bool))
+    assert lifted.tolist() == [True] * 36 + [False] * 4

@@ -7,15 +7,22 @@ from types import ModuleType
 from Testing.Studies.simulators import (
     bedside_lines,
     bench_lines,
+    disc_lines,
     echo_lines,
     facet_lines,
     grid_lines,
     kirchhoff_lines,
+    latency_lines,
     layer_lines,
     page_lines,
+    piston_lines,
     plain_lines,
     range_lines,
+    relief_lines,
+    scan_lines,
     session_lines,
+    sparse_lines,
+    stroke_lines,
     theatre_lines,
     tissue_lines,
 )
@@ -26,5 +33,20 @@ def _by_name(*modules: ModuleType) -> dict[str, ModuleType]:
 
 
 HARD = _by_name(echo_lines, tissue_lines, bench_lines, page_lines)  # drawn to be hard, their lines hardly follow each other
-SESSIONS = _by_name(session_lines, bedside_lines, facet_lines, theatre_lines, range_lines, layer_lines)  # as they go on a head
-UNSEEN = _by_name(plain_lines, grid_lines, kirchhoff_lines)  # no network is fitted to them
+SESSIONS = _by_name(  # as they go on a head
+    session_lines,
+    bedside_lines,
+    facet_lines,
+    theatre_lines,
+    range_lines,
+    layer_lines,
+    grid_lines,
+    kirchhoff_lines,
+    scan_lines,
+    piston_lines,
+    disc_lines,
+    relief_lines,
+    stroke_lines,
+    sparse_lines,
+)
+UNSEEN = _by_name(plain_lines, latency_lines)  # no network is fitted to them

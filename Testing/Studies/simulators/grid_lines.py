@@ -1,9 +1,9 @@
-"""Simulated A-lines drawn for an acceptance test: every quantity over its whole range, and the lines that must be accepted.
+"""Simulated A-lines drawn as for an acceptance test: every quantity over its whole range, and the lines that must be accepted.
 
-Nothing is ever fitted to this family: the detector is judged by it. It is plain in its echoes, each one a Gaussian pulse with the
-phase of the recording, which the tissue's loss moves down in frequency. What the other families lack is how it judges: its set-up
-comes from anywhere in the stated ranges, the receiver is blanked or the element rings on after the transmitted pulse, a short
-delay line puts multiples among the depths, and of each line the world says whether an expert would demand it, and what it is.
+It is plain in its echoes, each one a Gaussian pulse with the phase of the recording, which the tissue's loss moves down in
+frequency. What the other families lack: its set-up comes from anywhere in the stated ranges, the receiver is blanked or the
+element rings on after the transmitted pulse, a short delay line puts multiples among the depths, and of each line the world says
+whether an expert would demand it, and what it is.
 What a recording is drawn from is in grid_plan.py.
 """
 

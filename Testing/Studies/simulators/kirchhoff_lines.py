@@ -1,10 +1,10 @@
-"""Simulated A-lines whose surfaces are sums over the beam's footprint (Kirchhoff), to judge the detector by.
+"""Simulated A-lines whose surfaces are sums over the beam's footprint (Kirchhoff).
 
-No network and no map of the quality is ever fitted to these lines. One model makes every line: the delay line answers with the
-second and third power of all that comes back at its end, and the skin sends echoes down again, so that all multiples follow from
-it. What the families for the fit lack: a face that is wet in part, a hand that leans over for a second, holes and their edges as
-the part of the footprint that has bone, soft places with fascias as strong as before bone, short delay lines whose multiples fall
-into the scalp. The world says which lines a detector has to accept: bone that stands over noise, tissue and multiples.
+One model makes every line: the delay line answers with the second and third power of all that comes back at its end, and the skin
+sends echoes down again, so that all multiples follow from it. What the other families lack: a face that is wet in part, a hand
+that leans over for a second, holes and their edges as the part of the footprint that has bone, soft places with fascias as strong
+as before bone, short delay lines whose multiples fall into the scalp. The world says which lines a detector has to accept: bone
+that stands over noise, tissue and multiples.
 What a recording is drawn from is in kirchhoff_plan.py, the hand's way in kirchhoff_hand.py, the echoes in kirchhoff_echoes.py.
 """
 

@@ -3,7 +3,7 @@
 What the other families lack: a delay line's stated time is off by the trigger's latency, its true speed and its warming, as much
 as a millimetre of tissue. A pulse rises faster than it falls and is off the stated frequency; the disc averages a mirror's
 arrivals, which refraction in the delay line shifts; the shortest path to a spherical bone comes first. Drops hang on the face in
-air, bubbles and hair take single lines away, the glide passes a burr hole. No detector is ever fitted to this family: it judges
+air, bubbles and hair take single lines away, the glide passes a burr hole. No network is ever fitted to this family: it judges
 those that were fitted to others. What a recording is drawn from is in latency_plan.py, how the hand goes in latency_hand.py, what
 answers in latency_echoes.py.
 """

@@ -33,6 +33,7 @@ PATHS_MM = np.linspace(0, 30, 13)  # depths for which the pulse is tabulated
 SKULL_US_MM = 2 / 3.0  # there and back in bone
 FAINT_DB = -60.0
 LEAST_CODES = 0.5  # standard deviation of the noise: a converter that shows less shows no noise at all
+RUNGS = 6  # of the ladder that a film of gel shows
 HARD_SHARE = 0.2  # of the lines with bone: of which nobody could say where the bone is
 CLEAR_DB, HEARD_DB = 3.0, 8.0  # over all before it, over the noise: what an expert asks of bone
 SPECKLE_PEAK = 2.5  # its largest echoes over their RMS
@@ -179,6 +180,7 @@ def simulate(rng: np.random.Generator, frames: int, session: Session | None = No
         height = np.where(kind == "nothing", 0.0, way.layers[:, number] * way.coupling)
         sheet.add(skin_us + way.layers_mm[:, number] * 2e3 / session.speed_m_s, height, np.nan_to_num(way.layers_mm[:, number]))
     _bone(sheet, way, skin_us, arrival, np.nan_to_num(bone))
+    _film(sheet, way, skin_us)
     _probe(sheet, way, skin_us, noise * 10 ** (session.snr_db / 20))
     sheet.draw(0.03 * noise)
     sheet.rf += _bang(session, samples)
@@ -258,6 +260,17 @@ def _bone(sheet: Sheet, way: Way, skin_us: Array, arrival: Array, height: Array)
     sheet.add(2 * arrival - skin_us, -height * 10 ** (session.again_db / 20), 2 * way.depth_mm)
     if session.acquisition.forerun_length_mm:
         sheet.add(arrival + skin_us, 2 * height * session.face_r * session.back, way.depth_mm)
+
+
+def _film(sheet: Sheet, way: Way, skin_us: Array) -> None:
+    """A thin film of gel sends sound to and fro between the air behind it and the probe's face: a ladder of echoes."""
+    if np.isnan(way.film_mm).all():
+        return
+    once = np.nan_to_num(way.film_mm)
+    height = np.where(once > 0, -way.coupling / BONE_R, 0.0)
+    for rung in range(1, RUNGS + 1):
+        sheet.add(skin_us + rung * once * 2e3 / sheet.pulse.session.speed_m_s, height, np.zeros_like(once))
+        height = height * way.film_r
 
 
 def _probe_echoes(session: Session, way: Way, skin_us: Array, typical: float) -> list[tuple[Array, Array]]:

@@ -18,6 +18,7 @@ Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
 DEPTH_MM = (2.0, 15.0)
+FILM_MM = (0.4, 1.7)  # of gel, with air behind
 BONE_R = 0.57  # amplitude that bone reflects under soft tissue
 MATERIALS = ((1616.0, 0.05), (2170.0, -0.05), (2340.0, -0.20), (2460.0, -0.17), (2670.0, -0.316))  # m/s, reflection to tissue
 LEAST_LINES, MOST_LINES, MOST_PLACES = 5, 20, 8  # of a place; of a recording
@@ -67,7 +68,7 @@ class Session:
     typical_mm: float
     spread: float  # of the places' depths
     behind_mm: float  # seen behind the deepest bone
-    without: str  # a recording without bone: tissue, air, nothing
+    without: str  # a recording without bone: tissue, air, nothing, film
     miss_share: float  # of the places
     glides: bool
     lifts: bool  # the poses show how the hand lifts
@@ -96,7 +97,7 @@ def draw_session(rng: np.random.Generator) -> Session:
     acquisition, speed, reflection = _draw_device(rng)
     forerun = acquisition.forerun_length_mm > 0
     typical = float(rng.uniform(*DEPTH_MM))
-    without = str(rng.choice(["", "tissue", "air", "nothing"], p=[0.87, 0.07, 0.03, 0.03]))
+    without = str(rng.choice(["", "tissue", "air", "nothing", "film"], p=[0.86, 0.07, 0.03, 0.02, 0.02]))
     damped = rng.random() < 1 / 3
     static = [
         (float(rng.uniform(1.5, 17)), float(rng.uniform(-25, -5)), bool(forerun and rng.random() < 0.5))
@@ -156,13 +157,15 @@ class Way:
     """Where the hand goes, line by line, and what lies under it."""
 
     place: npt.NDArray[np.int64]  # (n,)
-    kind: npt.NDArray[np.str_]  # (n,) bone, tissue, nothing
+    kind: npt.NDArray[np.str_]  # (n,) bone, tissue, nothing, film: of gel, with air behind
     depth_mm: Array  # (n,) of the bone, or where it would be
     tilt_deg: Array  # (n, 2)
     contact: Array  # (n,) 1: full; 0: air
     loss_db: Array  # (n,) by hair or a dry patch
     layers_mm: Array  # (n, 4) NaN: none
     layers: Array  # (n, 4) their echoes over bone's
+    film_mm: Array  # (n,) its thickness; NaN: none
+    film_r: float  # reflection of the probe's face in the film
 
     @property
     def coupling(self) -> Array:
@@ -192,15 +195,18 @@ def draw_way(session: Session, rng: np.random.Generator, frames: int, skill: flo
     if session.glides and missing.any():  # a hole on the way, not the whole way
         start = int(rng.integers(frames))
         missing = (np.arange(frames) >= start) & (np.arange(frames) < start + max(frames // 5, 2))
-    kind = np.where(missing, rng.choice(["tissue", "nothing"], len(sizes), p=[0.75, 0.25])[place], "bone")
+    kind = np.where(missing, rng.choice(["tissue", "nothing", "film"], len(sizes), p=[0.65, 0.2, 0.15])[place], "bone")
     if session.without:
-        kind = np.full(frames, "nothing" if session.without == "nothing" else "tissue")
+        kind = np.full(frames, "tissue" if session.without == "air" else session.without)
         contact = np.zeros(frames) if session.without == "air" else contact
     layers_mm, layers = _layers(session, rng, place, depth, tilt)
     layers_mm[:, 3] = np.where(kind == "tissue", layers_mm[:, 3], np.nan)
-    layers_mm[kind == "nothing"] = np.nan
+    layers_mm[(kind == "nothing") | (kind == "film")] = np.nan
     loss = _dry(rng, sizes)
-    return Way(place, kind.astype(np.str_), depth, tilt, contact, loss, layers_mm, layers)
+    thickness = rng.uniform(*FILM_MM, len(sizes))[place] * (1 + rng.uniform(0, 0.02) * _tremor(rng, frames)[:, 0])
+    film_mm = np.where(kind == "film", thickness, np.nan)
+    film_r = session.face_r if session.acquisition.forerun_length_mm else float(rng.uniform(-0.5, 0.5))
+    return Way(place, kind.astype(np.str_), depth, tilt, contact, loss, layers_mm, layers, film_mm, film_r)
 
 
 def _sizes(rng: np.random.Generator, frames: int) -> list[int]:

@@ -1,11 +1,10 @@
 """Simulated A-lines of a hand that dwells, sweeps, or takes a single line of each place; the lobe of a disc at every frequency.
 
-Nothing is ever fitted to this family: the detector is judged by it. What the other families lack: the transmitted pulse rises
-faster than it decays, time zero is its peak; bone answers a tilt as the diffraction of a disc has it, by frequency, until only
-the facets frozen on it are seen; the delay line's true speed is not the stated one and drifts with its warmth; a strong galea can
-outshout bone; hair or a bubble comes under the probe, gel rings under a lifted one; the trigger jitters; in sparse recordings no
-line is like the one before. What a recording is drawn from is in sparse_plan.py, what answers from under the skin in
-sparse_echoes.py.
+What the other families lack: the transmitted pulse rises faster than it decays, time zero is its peak; bone answers a tilt as the
+diffraction of a disc has it, by frequency, until only the facets frozen on it are seen; the delay line's true speed is not the
+stated one and drifts with its warmth; a strong galea can outshout bone; hair or a bubble comes under the probe, gel rings under a
+lifted one; the trigger jitters; in sparse recordings no line is like the one before. What a recording is drawn from is in
+sparse_plan.py, what answers from under the skin in sparse_echoes.py.
 """
 
 from __future__ import annotations
