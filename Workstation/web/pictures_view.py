@@ -22,7 +22,8 @@ STYLE = """
 # What it drew it says once a frame, so that a window that cannot keep up is sent less. A view that is not on the page keeps
 # its last picture until it is; another layout makes new canvases, which show the last picture until theirs comes.
 WORKER = f"""
-const canvases = new Map(), decoded = new Map(), latest = new Map(), last = new Map(), utf8 = new TextDecoder();
+const canvases = new Map(), aside = new Map();
+const decoded = new Map(), latest = new Map(), last = new Map(), utf8 = new TextDecoder();
 let address = '', socket = null, frame = 0;
 
 const paint = (canvas, picture) => {{
@@ -73,9 +74,14 @@ self.onmessage = ({{ data }}) => {{
     address = data.address;
     return connect();
   }}
-  if (!data.canvas) return canvases.delete(data.area);
-  canvases.set(data.area, data.canvas);
-  if (last.has(data.area)) paint(data.canvas, last.get(data.area));
+  if (data.away) {{
+    aside.set(data.area, canvases.get(data.area));
+    return canvases.delete(data.area);
+  }}
+  const canvas = data.canvas || aside.get(data.area);
+  if (!canvas) return;
+  canvases.set(data.area, canvas);
+  if (last.has(data.area)) paint(canvas, last.get(data.area));
   if (decoded.has(data.area)) frame = frame || requestAnimationFrame(draw);
 }};
 """
@@ -86,6 +92,7 @@ SCRIPT = f"""
   const worker = window.cranionavPictures = new Worker(URL.createObjectURL(source));
   const address = new URL('{PICTURES}', window.location.href), words = {words.PICTURE_OLD!r}, given = new Map();
   let told = {{}}, heard = performance.now();
+  const transferred = new WeakSet();  // a canvas gives its drawing away once, and may leave the page and come back
   address.protocol = address.protocol.replace('http', 'ws');
 
   worker.onmessage = ({{ data }}) => {{
@@ -97,14 +104,19 @@ SCRIPT = f"""
     for (const canvas of document.querySelectorAll('canvas[data-picture]')) {{
       const area = canvas.dataset.picture;
       if (given.get(area) === canvas) continue;
-      const offscreen = canvas.transferControlToOffscreen();
       given.set(area, canvas);
+      if (transferred.has(canvas)) {{
+        worker.postMessage({{ area }});
+        continue;
+      }}
+      transferred.add(canvas);
+      const offscreen = canvas.transferControlToOffscreen();
       worker.postMessage({{ area, canvas: offscreen }}, [offscreen]);
     }}
     for (const [area, canvas] of given) {{
       if (canvas.isConnected) continue;
       given.delete(area);
-      worker.postMessage({{ area }});
+      worker.postMessage({{ area, away: true }});
     }}
   }};
   const say = () => {{
