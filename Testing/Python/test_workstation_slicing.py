@@ -92,7 +92,7 @@ def test_a_new_window_or_ct_is_seen_at_once(a_slice_view):
     picture.draw()
     for change in (lambda: display.SetWindowLevel(80.0, 40.0), lambda: display.SetWindowLevel(1500.0, 300.0)):
         change()
-        assert np.abs(picture.draw().astype(int) - drawn(view, True)).max() <= 1
+        assert np.abs(picture.draw().astype(int) - drawn(view, True)).max() <= 2  # rounding, as above
     values = view.volume.GetImageData().GetPointData().GetScalars()
     values.Fill(700)
     values.Modified()
