@@ -203,4 +203,6 @@ def test_a_view_says_that_its_picture_is_old_and_no_longer_when_it_is_not():
         page.wait_for_timeout(300)
         page.evaluate("() => document.body.append(window.view)")
         page.wait_for_function(f"({grey})() < 60")
+        room.paint(150)  # it goes on being drawn
+        page.wait_for_function(f"({grey})() > 140")
         assert user.defects == []
