@@ -32,7 +32,7 @@ from Testing.Studies.simulators.disc_plan import (
     draw_statuses,
     wander,
 )
-from Testing.Studies.simulators.echo_powers import echo_powers
+from Testing.Studies.simulators.echo_spectra import echo_spectra, short_peaks
 from Testing.Studies.simulators.line_truth import Truth
 
 Floats = npt.NDArray[np.float32]
@@ -41,7 +41,6 @@ Complex = npt.NDArray[np.complex64]
 NEPER = np.log(10) / 20  # a decibel
 GUARD_US = 5.0  # behind the last sample: what rings there does not come round to the first
 WIDE = 3.6  # standard deviations of the pulse's spectrum that are simulated
-BLOCK = 32  # frequencies a block of a geometric series
 STRIPS, SCATTERERS = 25, 14  # the disc; the rough bone
 ECHO_US = 8.0  # no echo of bone is longer
 MULTIPLES = 5  # of the delay line's echo
@@ -81,27 +80,16 @@ class Band:
         return np.asarray(np.exp(-2j * np.pi * time_us * self.mhz), dtype=np.complex64)
 
     def echoes(self, time_us: Array, height: Array, depth_mm: Array) -> Complex:
-        """Sum of echoes (n, m) over the pulse, as spectra (n, band): when, how high before attenuation, how deep they have been.
-
-        Delay and attenuation are a geometric series in frequency: powers within a block times powers of whole blocks.
-        """
+        """Sum of echoes (n, m) over the pulse, as spectra (n, band): when, how high unattenuated, from how deep."""
         heard = time_us < self.last_us
         time = np.where(heard, time_us, 0.0)
         lost = 0.2 * NEPER * self.setup.attenuation * depth_mm
-        blocks = -(-len(self.mhz) // BLOCK)
-        starts = self.mhz[0] + np.arange(blocks) * (BLOCK * self.step_mhz)
-        coarse = echo_powers(time, lost, starts) * np.where(heard, height, 0.0)[:, :, None].astype(np.float32)
-        fine = echo_powers(time, lost, np.arange(BLOCK) * self.step_mhz)
-        total = np.matmul(coarse.transpose(0, 2, 1), fine)
-        return np.asarray(total.reshape(len(time), -1)[:, : len(self.mhz)])
+        return echo_spectra(time, np.where(heard, height, 0.0), lost, self.mhz, self.step_mhz)
 
     def peaks(self, spectra: Complex) -> Array:
         """Height of the envelope's peak (n,) of one short echo each."""
         every = max(int(1 / (ECHO_US * self.step_mhz)), 1)
-        thin = (spectra * self.pulse)[:, ::every]
-        size = scipy.fft.next_fast_len(3 * thin.shape[1])
-        envelope = np.abs(scipy.fft.ifft(thin, size, axis=1)).max(axis=1)
-        return np.asarray(envelope * (2 * every * size / self.size), dtype=float)
+        return short_peaks(spectra * self.pulse, every, self.size)
 
 
 @dataclass(frozen=True, eq=False)

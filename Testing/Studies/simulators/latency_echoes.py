@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.fft
 
-from Testing.Studies.simulators.echo_powers import echo_powers
+from Testing.Studies.simulators.echo_spectra import echo_spectra, short_peaks
 from Testing.Studies.simulators.latency_hand import Ground, Hand, draw_ground, draw_hand, wander
 from Testing.Studies.simulators.latency_plan import Array, Bools, Setup, decibel
 
@@ -22,7 +22,6 @@ Complex = npt.NDArray[np.complex64]
 NEPER = np.log(10) / 20  # a decibel
 GUARD_US = 8.0  # behind the last sample: what rings there does not come round to the first
 ECHO_US = 8.0  # no echo of bone is longer
-BLOCK = 32  # frequencies a block of a geometric series
 FAINT = 1e-4  # of the pulse's spectrum: not simulated
 PULSE_STEPS = 16  # a cycle
 ARRIVALS = 21  # over the disc
@@ -103,18 +102,10 @@ class Band:
         return float(NEPER * delay.loss_db_cm * 2 * delay.length_mm / 10 / 5)
 
     def echoes(self, time_us: Array, height: npt.NDArray[np.generic], lost: Array) -> Complex:
-        """Sum of echoes (n, m) over the pulse, as spectra (n, band): when, how high, and what they lost in neper a MHz.
-
-        Delay and attenuation are a geometric series in frequency: powers within a block times powers of whole blocks.
-        """
+        """Sum of echoes (n, m) over the pulse, as spectra (n, band): when, how high, and what they lost in neper a MHz."""
         heard = time_us < self.last_us
         time = np.where(heard, time_us, 0.0)
-        blocks = -(-len(self.mhz) // BLOCK)
-        starts = self.mhz[0] + np.arange(blocks) * (BLOCK * self.step_mhz)
-        coarse = echo_powers(time, lost, starts) * np.where(heard, height, 0).astype(np.complex64)[:, :, None]
-        fine = echo_powers(time, lost, np.arange(BLOCK) * self.step_mhz)
-        total = np.matmul(coarse.transpose(0, 2, 1), fine)
-        return np.asarray(total.reshape(len(time), -1)[:, : len(self.mhz)])
+        return echo_spectra(time, np.where(heard, height, 0), lost, self.mhz, self.step_mhz)
 
     def echo(self, time_us: Array, lost: Array) -> Complex:
         """One echo of height 1 a line (n, band)."""
@@ -123,10 +114,7 @@ class Band:
     def peaks(self, spectra: Complex) -> Array:
         """Height of the envelope's peak (n,) of one short echo each."""
         every = max(int(1 / (ECHO_US * self.step_mhz)), 1)
-        thin = (spectra * self.pulse)[:, ::every]
-        size = scipy.fft.next_fast_len(3 * thin.shape[1])
-        envelope = np.abs(scipy.fft.ifft(thin, size, axis=1)).max(axis=1)
-        return np.asarray(envelope * (2 * every * size / self.size), dtype=float)
+        return short_peaks(spectra * self.pulse, every, self.size)
 
 
 @dataclass(frozen=True, eq=False)

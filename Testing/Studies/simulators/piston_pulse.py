@@ -7,7 +7,7 @@ import numpy.typing as npt
 import scipy.fft
 from scipy.special import gamma, j1
 
-from Testing.Studies.simulators.echo_powers import echo_powers
+from Testing.Studies.simulators.echo_spectra import echo_spectra
 from Testing.Studies.simulators.piston_plan import Array, Setup
 
 Floats = npt.NDArray[np.float32]
@@ -86,18 +86,10 @@ class Pulse:
         return np.asarray(JINC[np.minimum(index, len(JINC) - 1)])
 
     def series(self, time_us: Array, height: Array, depth_mm: Array) -> Complex:
-        """Sum of echoes (n,) or (n, m) over the pulse, as spectra (n, band).
-
-        Delay and attenuation of an echo are a geometric series in frequency: powers within a block times powers of whole blocks.
-        """
+        """Sum of echoes (n,) or (n, m) over the pulse, as spectra (n, band)."""
         time, high, depth = (np.reshape(one, (len(time_us), -1)) for one in (time_us, height, depth_mm))
         lost = 0.2 * NEPER * self.setup.attenuation * depth
-        blocks = -(-len(self.mhz) // BLOCK)
-        coarse = echo_powers(time, lost, self.mhz[0] + np.arange(blocks) * (BLOCK * self.step_mhz))
-        coarse *= high[:, :, None].astype(np.float32)
-        fine = echo_powers(time, lost, np.arange(BLOCK) * self.step_mhz)
-        total = np.matmul(coarse.transpose(0, 2, 1), fine)
-        return np.asarray(total.reshape(len(time), -1)[:, : len(self.mhz)])
+        return echo_spectra(time, high, lost, self.mhz, self.step_mhz, BLOCK)
 
     def kernel(self, depth_mm: float) -> tuple[Floats, int]:
         """Samples of a scatterer's echo from a depth, and which of them is at time zero."""

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import scipy.fft
 from scipy.special import j1
 
-from Testing.Studies.simulators.echo_powers import echo_powers
+from Testing.Studies.simulators.echo_spectra import echo_spectra, short_peaks
 from Testing.Studies.simulators.sparse_plan import Array, Setup
 
 Floats = npt.NDArray[np.float32]
@@ -17,7 +17,6 @@ NEPER = np.log(10) / 20  # a decibel
 GUARD_US = 4.0  # behind the last sample: what rings there does not come round to the first
 HEARD_US = 1.5  # behind the last sample: an echo that comes later is left out
 FAINT = 3e-6  # of the pulse's spectrum, over its height: what is less is left out
-BLOCK = 32  # frequencies a block of a geometric series
 LOBE_STEP, LOBE_LAST = 0.002, 60.0  # of the table of a disc's lobe
 
 
@@ -47,19 +46,11 @@ class Band:
         self.last_us = samples / setup.sampling_mhz + HEARD_US
 
     def echoes(self, time_us: Array, height: npt.ArrayLike, lost_db_mhz: npt.ArrayLike) -> Complex:
-        """Sum of echoes (n, m) over the pulse, as spectra (n, band): when, how high before the loss, and the loss.
-
-        Delay and loss are a geometric series in frequency: powers within a block times powers of whole blocks.
-        """
+        """Sum of echoes (n, m) over the pulse, as spectra (n, band): when, how high before the loss, and the loss."""
         heard = time_us < self.last_us
         time = np.where(heard, time_us, 0.0)
         lost = np.broadcast_to(NEPER * np.asarray(lost_db_mhz), time.shape)
-        blocks = -(-len(self.mhz) // BLOCK)
-        starts = self.mhz[0] + np.arange(blocks) * (BLOCK * self.step_mhz)
-        coarse = echo_powers(time, lost, starts) * np.where(heard, height, 0.0)[:, :, None].astype(np.float32)
-        fine = echo_powers(time, lost, np.arange(BLOCK) * self.step_mhz)
-        total = np.matmul(coarse.transpose(0, 2, 1), fine)
-        return np.asarray(total.reshape(len(time), -1)[:, : len(self.mhz)])
+        return echo_spectra(time, np.where(heard, height, 0.0), lost, self.mhz, self.step_mhz)
 
     def loss(self, db_mhz: float) -> Floats:
         """What is left of each frequency (band,)."""
@@ -74,10 +65,7 @@ class Band:
     def peaks(self, spectra: npt.NDArray[np.complexfloating] | Floats, lasts_us: float) -> Array:
         """Height of the envelope's peak (n,) of echoes that last no longer than stated."""
         every = max(int(1 / (lasts_us * self.step_mhz)), 1)
-        thin = (spectra * self.pulse)[:, ::every]
-        size = scipy.fft.next_fast_len(3 * thin.shape[1])
-        envelope = np.abs(scipy.fft.ifft(thin, size, axis=1)).max(axis=1)
-        return np.asarray(envelope * (2 * every * size / self.size), dtype=float)
+        return short_peaks(spectra * self.pulse, every, self.size)
 
     def waves(self, spectra: Complex) -> Floats:
         """Samples (n, samples) of what comes back as these spectra (n, band) over the pulse."""

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import scipy.fft
 from CranioNavLib.recording import Recording
 
-from Testing.Studies.simulators.echo_powers import echo_powers
+from Testing.Studies.simulators.echo_spectra import echo_spectra
 from Testing.Studies.simulators.line_truth import Truth
 from Testing.Studies.simulators.theatre_plan import Array, Bools, Hand, Theatre, draw_hand, draw_poses, draw_status, draw_theatre
 
@@ -27,7 +27,6 @@ NEPER = np.log(10) / 20  # a decibel
 BONE_R = 0.60  # amplitude that bone reflects under soft tissue
 BONE_US_MM = 2 / 2.85  # there and back in bone
 HALF = 1.177  # standard deviations of a Gaussian's half width at half height
-BLOCK = 32  # frequencies a block of a geometric series
 FAINT = 2e-4  # of the pulse's largest frequency: not simulated below
 GUARD_US = 4.0  # behind the last sample: what begins there goes round to the first
 ECHO_US = 8.0  # no echo of bone is longer
@@ -62,17 +61,9 @@ class Pulse:
         return np.asarray(np.exp(turns - 0.5 * (time / width) ** 2))
 
     def series(self, time_us: Array, height: Array, path_mm: Array) -> Complex:
-        """Sum of echoes (n, m) over the pulse, as spectra (n, band).
-
-        Delay and attenuation of an echo are a geometric series in frequency: powers within a block times powers of whole blocks.
-        """
+        """Sum of echoes (n, m) over the pulse, as spectra (n, band)."""
         lost = 0.2 * NEPER * self.theatre.attenuation * path_mm
-        blocks = -(-len(self.mhz) // BLOCK)
-        starts = self.mhz[0] + np.arange(blocks) * (BLOCK * self.step_mhz)
-        coarse = echo_powers(time_us, lost, starts) * height[:, :, None].astype(np.float32)
-        fine = echo_powers(time_us, lost, np.asarray(np.arange(BLOCK) * self.step_mhz, dtype=float))
-        total = np.matmul(coarse.transpose(0, 2, 1), fine)
-        return np.asarray(total.reshape(len(time_us), -1)[:, : len(self.mhz)])
+        return echo_spectra(time_us, height, lost, self.mhz, self.step_mhz)
 
     def peaks(self, shape: Complex, height: Array, path_mm: Array) -> Array:
         """Height of the envelope of echoes at time zero (n,), of spectra `shape` over the pulse."""
