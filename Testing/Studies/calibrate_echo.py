@@ -3,7 +3,7 @@
     python -m Testing.Studies.calibrate_echo --worlds 4400 --seed 30 [--cache DIR]
 
 The recordings come from families of simulated lines that share no model (Testing/Studies/simulators). Four are drawn to be hard,
-one is a water bath, where there is bone and nothing else, and fourteen go as a palpation session does: the hand comes down,
+one is a water bath, where there is bone and nothing else, and seventeen go as a palpation session does: the hand comes down,
 searches the perpendicular, holds, lifts. Each recording has its own pulse, transducer, forerun, tissue, noise and clutter. A
 tenth of the recordings is kept out of the fit; they judge it, and on them and on families that nothing is fitted to (UNSEEN)
 the stated quality is mapped to the share of depths that were right. The same seed gives the same table; the one in the
@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import pickle
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.recording import Recording
 from ModuleUltrasoundLib.echo.likelihood import shared_features
-from ModuleUltrasoundLib.echo.network import WEIGHTS, Likelihood, Network, probabilities, write_likelihood
+from ModuleUltrasoundLib.echo.network import WEIGHTS, Committee, Likelihood, probabilities, write_likelihood
 from ModuleUltrasoundLib.echo.search import Found, search_lines
 from ModuleUltrasoundLib.measurement.measure import DEFAULT_SETTINGS, EchoSettings, measure_lines, places_of, stays
 from ModuleUltrasoundLib.measurement.quality import TOLERANCE_MM
@@ -40,7 +40,8 @@ FAMILIES = (
     | {"bare_lines": 0.5, "session_lines": 1.0}
     | dict.fromkeys(sorted(SESSIONS.keys() - {"session_lines"}), 0.5)
 )
-TURNS = 2  # networks: a line by itself, then with the recording around it; a third adds little and costs a tenth of the time
+MEMBERS = 3  # networks of a turn: one alone is better or worse by chance (lines without bone accepted: 0.5 to 0.9 %)
+TURNS = 2  # a line by itself, then with the recording around it; a third adds little and costs a tenth of the time
 LABEL_MM = 0.4  # a candidate this near to the bone stands for it
 LATE_CYCLES = 1.2  # without a forerun echo the peak of a pulse that rises at its arrival comes later; corrected afterwards
 LINES_EACH = 24  # of a recording, for the fit: further ones say little new
@@ -135,11 +136,11 @@ def lines_of(worlds: list[World], features: list[Array], rng: np.random.Generato
     )
 
 
-def seen_by(world: World, networks: list[Network]) -> Array:
-    """The features of the next turn after `networks`: the line's own and the recording's."""
-    scores = networks[0].scores(world.found.features)
-    for network in networks[1:]:
-        scores = network.scores(_with_shared(world, scores))
+def seen_by(world: World, turns: list[Committee]) -> Array:
+    """The features of the next turn after `turns`: the line's own and the recording's."""
+    scores = turns[0].scores(world.found.features)
+    for committee in turns[1:]:
+        scores = committee.scores(_with_shared(world, scores))
     return _with_shared(world, scores)
 
 
@@ -147,22 +148,24 @@ def _with_shared(world: World, scores: Array) -> Array:
     return np.concatenate([world.found.features, shared_features(world.found, scores, world.runs)], axis=-1)
 
 
-def fit_turns(worlds: list[World], rng: np.random.Generator, epochs: int) -> tuple[Network, ...]:
-    """The networks, each fitted to what the ones before it say of recordings they have not seen, as it will be in use."""
+def fit_turns(worlds: list[World], rng: np.random.Generator, epochs: int, jobs: int) -> tuple[Committee, ...]:
+    """The committees, each fitted to what the ones before it say of recordings they have not seen, as it will be in use."""
     halves = [worlds[0::2], worlds[1::2]]
-    blind: list[list[Network]] = [[], []]  # of each half, fitted to the other half alone
-    networks: list[Network] = []
+    blind: list[list[Committee]] = [[], []]  # of each half, fitted to the other half alone
+    turns: list[Committee] = []
     for turn in range(TURNS):
         lines = []
         for half, fitted in zip(halves, blind):
             features = [seen_by(world, fitted) if turn else world.found.features for world in half]
             lines.append(lines_of(half, features, rng))
-        networks.append(fit(joined(lines), rng, epochs))
-        if turn + 1 < TURNS:
-            for number in (0, 1):
-                blind[1 - number].append(fit(lines[number], rng, epochs))
+        sets = [joined(lines)] * MEMBERS + (lines if turn + 1 < TURNS else [])
+        with ThreadPoolExecutor(jobs) as pool:
+            fitted_to = list(pool.map(partial(fit, epochs=epochs), sets, rng.spawn(len(sets))))
+        turns.append(Committee(tuple(fitted_to[:MEMBERS])))
+        for half_blind, network in zip(reversed(blind), fitted_to[MEMBERS:]):
+            half_blind.append(Committee((network,)))
         print(f"turn {turn + 1} fitted to {sum(len(part.labels) for part in lines)} lines", flush=True)
-    return tuple(networks)
+    return tuple(turns)
 
 
 def calibrate_quality(held: list[Simulated], likelihood: Likelihood) -> tuple[Array, Array]:
@@ -205,7 +208,7 @@ def monotone(stated: Array, right: Array) -> tuple[Array, Array]:
 
 
 def main() -> None:
-    """Simulate, fit both stages, judge them on the recordings kept out, write the table."""
+    """Simulate, fit both turns, judge them on the recordings kept out, write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--worlds", type=int, default=4400, help="recordings of each family")
     parser.add_argument("--seed", type=int, default=30)
@@ -226,28 +229,28 @@ def main() -> None:
                 held.append(one)
                 tests.append(searched)
     rng = np.random.default_rng(options.seed)
-    networks = fit_turns(worlds, rng, options.epochs)
+    turns = fit_turns(worlds, rng, options.epochs, options.jobs)
     for turn in range(TURNS):
-        judge(turn, networks[: turn + 1], held, tests)
+        judge(turn, turns[: turn + 1], held, tests)
     count = options.worlds // HELD_OUT
     unseen = [one for name in UNSEEN for one in family_of(name, options.seed * 1_000_000, count, options.cache, options.jobs)]
     straight = np.array([0.0, 1.0])
-    quality = calibrate_quality(held + unseen, Likelihood(networks, (straight, straight)))
+    quality = calibrate_quality(held + unseen, Likelihood(turns, (straight, straight)))
     print("quality", *quality, sep="\n")
     counts = ", ".join(f"{int(share * options.worlds)} {family}" for family, share in FAMILIES.items())
     note = f"simulated recordings, seed {options.seed}: {counts}"
-    write_likelihood(WEIGHTS, Likelihood(networks, quality), note)
+    write_likelihood(WEIGHTS, Likelihood(turns, quality), note)
 
 
-def judge(turn: int, networks: tuple[Network, ...], held: list[Simulated], tests: list[World]) -> None:
+def judge(turn: int, turns: tuple[Committee, ...], held: list[Simulated], tests: list[World]) -> None:
     """Print how well the recordings kept out are told: log loss, right among the sure, sure among the tellable."""
     for family in FAMILIES:
         loss, lines, sure, right, easy, easy_sure, none, none_sure = 0.0, 0, 0, 0, 0, 0, 0, 0
         for one, world in zip(held, tests):
             if one.family != family:
                 continue
-            features = seen_by(world, list(networks[:turn])) if turn else world.found.features
-            chance, rest = probabilities(networks[turn].scores(features), world.found.possible)
+            features = seen_by(world, list(turns[:turn])) if turn else world.found.features
+            chance, rest = probabilities(turns[turn].scores(features), world.found.possible)
             both = np.concatenate([chance, rest[:, None]], axis=1)
             rows = np.arange(len(both))
             loss -= float(np.log(both[rows, world.labels] + 1e-9).sum())

@@ -69,7 +69,7 @@ SHARED_NAMES = (
 def judge_echoes(found: Found, likelihood: Likelihood, runs: npt.NDArray[np.int64]) -> tuple[Array, Array]:
     """Probability (n, K) of each candidate to be the bone, and the last turn's shared features (n, K, len(SHARED_NAMES)).
 
-    `found` holds the scores of the likelihood's first network. A long glide is judged stretch by stretch: where the hand was
+    `found` holds the scores of the likelihood's first committee. A long glide is judged stretch by stretch: where the hand was
     tilted for half of the way says nothing about the other half, and the live sweep, which comes in batches, is judged alike.
     """
     count = len(runs)
@@ -87,10 +87,10 @@ def judge_echoes(found: Found, likelihood: Likelihood, runs: npt.NDArray[np.int6
 def _judge_together(found: Found, likelihood: Likelihood, runs: npt.NDArray[np.int64]) -> tuple[Array, Array]:
     scores, echoes = found.scores, Echoes.of(found.depths_mm, runs)
     shared = shared_features(found, scores, runs, echoes)
-    for turn, network in enumerate(likelihood.networks[1:]):
+    for turn, committee in enumerate(likelihood.turns[1:]):
         if turn:
             shared = shared_features(found, scores, runs, echoes)
-        scores = network.scores(np.concatenate([found.features, shared], axis=-1))
+        scores = committee.scores(np.concatenate([found.features, shared], axis=-1))
     chance, _ = probabilities(scores, found.possible)
     return chance, shared
 

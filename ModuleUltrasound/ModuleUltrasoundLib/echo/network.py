@@ -38,6 +38,20 @@ class Network:
         return values
 
 
+@dataclass(frozen=True, eq=False)
+class Committee:
+    """Networks fitted to the same lines from other beginnings; they score a candidate by their mean.
+
+    Where a tissue is like none they were fitted to, each is off its own way, and the mean less than any of them.
+    """
+
+    members: tuple[Network, ...]
+
+    def scores(self, features: npt.NDArray[np.floating[Any]]) -> Array:
+        """Log-odds (n, K) of features (n, K, D)."""
+        return np.asarray(sum(member.scores(features) for member in self.members) / len(self.members))
+
+
 def probabilities(scores: Array, valid: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
     """Softmax over the candidates and "none": probability of each candidate (n, K), and of none (n,)."""
     scores = np.where(valid, scores, -np.inf)
@@ -52,37 +66,41 @@ def probabilities(scores: Array, valid: npt.NDArray[np.bool_]) -> tuple[Array, A
 class Likelihood:
     """What was learnt about bone echoes.
 
-    The first network judges a line by itself; each further one judges it again with the recording around it, as the network
-    before it sees that recording.
+    The first committee judges a line by itself; each further one judges it again with the recording around it, as the
+    committee before it sees that recording.
     """
 
-    networks: tuple[Network, ...]
+    turns: tuple[Committee, ...]
     quality: tuple[Array, Array]  # quality before calibration, and the share that was right: knots
 
 
 def read_likelihood(path: Path) -> Likelihood:
     """The likelihood that `write_likelihood` has written."""
     table = json.loads(path.read_text(encoding="utf-8"))
-    networks = tuple(
-        Network(tuple((np.array(one["weights"], dtype=np.float32), np.array(one["biases"], dtype=np.float32)) for one in layers))
-        for layers in table["networks"]
+    turns = tuple(Committee(tuple(map(_network, members))) for members in table["turns"])
+    return Likelihood(turns, (np.array(table["quality"]["stated"]), np.array(table["quality"]["right"])))
+
+
+def _network(layers: list[dict[str, Any]]) -> Network:
+    return Network(
+        tuple((np.array(one["weights"], dtype=np.float32), np.array(one["biases"], dtype=np.float32)) for one in layers)
     )
-    return Likelihood(networks, (np.array(table["quality"]["stated"]), np.array(table["quality"]["right"])))
 
 
 def write_likelihood(path: Path, likelihood: Likelihood, note: str) -> None:
     """The likelihood as JSON, a row of numbers a line, four digits each."""
-    networks = ",\n".join(
-        "[\n"
-        + ",\n".join(
-            '{"weights": [\n' + ",\n".join(map(_row, weights)) + '],\n"biases": ' + _row(biases) + "}"
-            for weights, biases in network.layers
-        )
-        + "]"
-        for network in likelihood.networks
-    )
+    turns = ",\n".join("[\n" + ",\n".join(map(_layers, turn.members)) + "]" for turn in likelihood.turns)
     quality = f'{{"stated": {_row(likelihood.quality[0])},\n"right": {_row(likelihood.quality[1])}}}'
-    path.write_text(f'{{"note": {json.dumps(note)},\n"quality": {quality},\n"networks": [\n{networks}]}}\n', encoding="utf-8")
+    path.write_text(f'{{"note": {json.dumps(note)},\n"quality": {quality},\n"turns": [\n{turns}]}}\n', encoding="utf-8")
+
+
+def _layers(network: Network) -> str:
+    parts = (f'{{"weights": [\n{_lines(weights)}],\n"biases": {_row(biases)}}}' for weights, biases in network.layers)
+    return "[\n" + ",\n".join(parts) + "]"
+
+
+def _lines(weights: Weights) -> str:
+    return ",\n".join(map(_row, weights))
 
 
 def _row(values: npt.NDArray[np.floating[Any]]) -> str:

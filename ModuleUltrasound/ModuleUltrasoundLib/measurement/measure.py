@@ -126,7 +126,7 @@ def measure_lines(
         settings.speed_of_sound_m_s,
         (settings.least_depth_mm, settings.most_depth_mm),
         places=places_of(recording, runs),
-        rank=likelihood.networks[0].scores,
+        rank=likelihood.turns[0].scores,
     )
     chance, shared = judge_echoes(found, likelihood, runs)
     best = choose(found.depths_mm, chance)

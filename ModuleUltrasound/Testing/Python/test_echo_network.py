@@ -3,7 +3,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from ModuleUltrasoundLib.echo.network import Likelihood, Network, learnt, probabilities, read_likelihood, write_likelihood
+from ModuleUltrasoundLib.echo.network import (
+    Committee,
+    Likelihood,
+    Network,
+    learnt,
+    probabilities,
+    read_likelihood,
+    write_likelihood,
+)
 from scipy.special import softmax
 
 
@@ -39,16 +47,28 @@ def test_network_is_a_plain_perceptron(a_network):
     assert a_network.scores(x) == pytest.approx(np.maximum(x @ w + b, 0) @ v[:, 0] + c[0], abs=1e-5)
 
 
+def test_committee_scores_by_the_mean_of_its_members(a_network):
+    b_network = Network(tuple((-2 * weights, biases + 1) for weights, biases in a_network.layers))
+    x = np.random.default_rng(1).normal(size=(2, 5, 3))
+    mean = (a_network.scores(x) + b_network.scores(x)) / 2
+    assert Committee((a_network, b_network)).scores(x) == pytest.approx(mean, abs=1e-6)
+    assert Committee((a_network,)).scores(x) == pytest.approx(a_network.scores(x), abs=0)
+
+
 def test_likelihood_comes_back_from_its_file_to_four_digits(a_network, tmp_path):
+    b_network = Network(tuple((weights + 1, biases) for weights, biases in a_network.layers))
     quality = (np.array([0.0, 0.31, 1.0]), np.array([0.0, 0.25, 0.999]))
-    write_likelihood(tmp_path / "w.json", Likelihood((a_network, a_network), quality), 'a "note"')
+    write_likelihood(
+        tmp_path / "w.json", Likelihood((Committee((a_network,)), Committee((b_network, a_network))), quality), 'a "note"'
+    )
     back = read_likelihood(tmp_path / "w.json")
     assert back.quality == (pytest.approx(quality[0]), pytest.approx(quality[1]))
-    assert len(back.networks) == 2
-    for (weights, biases), (w, b) in zip(back.networks[1].layers, a_network.layers):
-        assert weights.shape == w.shape
-        assert weights == pytest.approx(w, rel=5e-4)
-        assert biases == pytest.approx(b, rel=5e-4)
+    assert [len(turn.members) for turn in back.turns] == [1, 2]
+    for read, written in zip(back.turns[1].members, (b_network, a_network)):
+        for (weights, biases), (w, b) in zip(read.layers, written.layers):
+            assert weights.shape == w.shape
+            assert weights == pytest.approx(w, rel=5e-4)
+            assert biases == pytest.approx(b, rel=5e-4)
 
 
 def test_networks_that_were_learnt_take_the_features_that_are_made():
@@ -56,4 +76,5 @@ def test_networks_that_were_learnt_take_the_features_that_are_made():
     from ModuleUltrasoundLib.echo.likelihood import SHARED_NAMES
 
     own, shared = len(NAMES), len(NAMES) + len(SHARED_NAMES)
-    assert [network.layers[0][0].shape[0] for network in learnt().networks] == [own] + [shared] * (len(learnt().networks) - 1)
+    for number, turn in enumerate(learnt().turns):
+        assert {member.layers[0][0].shape[0] for member in turn.members} == {shared if number else own}

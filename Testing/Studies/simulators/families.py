@@ -7,6 +7,7 @@ from types import ModuleType
 from Testing.Studies.simulators import (
     bedside_lines,
     bench_lines,
+    device_lines,
     disc_lines,
     echo_lines,
     facet_lines,
@@ -19,9 +20,11 @@ from Testing.Studies.simulators import (
     plain_lines,
     range_lines,
     relief_lines,
+    rough_lines,
     scan_lines,
     session_lines,
     sparse_lines,
+    sphere_lines,
     stroke_lines,
     theatre_lines,
     tissue_lines,
@@ -48,5 +51,8 @@ SESSIONS = _by_name(  # as they go on a head
     relief_lines,
     stroke_lines,
     sparse_lines,
+    rough_lines,
+    device_lines,
+    sphere_lines,
 )
 UNSEEN = _by_name(plain_lines, latency_lines)  # no network is fitted to them
