@@ -4,6 +4,13 @@ import numpy as np
 from scipy.signal import hilbert
 
 
+def stated_skin_s(recording):
+    """Where the delay line ends, as the header has it."""
+    acquisition = recording.acquisition
+    late_s = 2e-3 * acquisition.forerun_length_mm / (acquisition.forerun_speed_m_s or 1.0)
+    return np.full(len(recording), late_s)
+
+
 def peaks_off_mm(recording, truth, rows, skin_s, near_s):
     """Peak of the envelope within `near_s` of bone, minus the truth, of the lines `rows`; the tissue starts at `skin_s` (n,)."""
     sampling = recording.acquisition.sampling_hz

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from simulated_peaks import peaks_off_mm
+from simulated_peaks import peaks_off_mm, stated_skin_s
 
 from Testing.Studies.simulators import disc_lines, disc_plan
 
@@ -23,13 +23,6 @@ def a_plain_setup():
     found = next(one for one in drawn if not (one.without or one.delay.length_mm) and one.depth_mm > 6 and one.attenuation < 1)
     plain = {"leaves": False, "sweeps": False, "places": 1, "spikes": False, "saturated": False, "fill": 0.3, "bits": 14}
     return replace(found, snr_db=40.0, **plain)
-
-
-def stated_skin_s(recording):
-    """Where the delay line ends, as the header has it."""
-    acquisition = recording.acquisition
-    late_s = 2e-3 * acquisition.forerun_length_mm / (acquisition.forerun_speed_m_s or 1.0)
-    return np.full(len(recording), late_s)
 
 
 @pytest.mark.parametrize(("asked", "given"), [(1, 8), (12, 12), (90, 90)])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from simulated_peaks import peaks_off_mm
+from simulated_peaks import peaks_off_mm, stated_skin_s
 
 from Testing.Studies.simulators import sphere_hand, sphere_lines, sphere_plan
 
@@ -24,13 +24,6 @@ def a_plain_setup():
     found = next(one for one in plainly if 4 < one.centre_mhz < 6 and one.sampling_mhz > 40)
     plain = {"sweeps": False, "spikes": False, "pickup": False, "saturated": False, "fill": 0.3, "bits": 14, "depth_gain": 0.0}
     return replace(found, snr_db=40.0, depths_mm=(6.0, 7.0, 8.0, 6.5), **plain)
-
-
-def stated_skin_s(recording):
-    """Where the delay line ends, as the header has it."""
-    acquisition = recording.acquisition
-    late_s = 2e-3 * acquisition.forerun_length_mm / (acquisition.forerun_speed_m_s or 1.0)
-    return np.full(len(recording), late_s)
 
 
 @pytest.mark.parametrize(("asked", "given"), [(1, 8), (12, 12), (90, 90)])
