@@ -150,4 +150,4 @@ def test_one_click_after_typing_is_enough(tmp_path):
         field.fill("nowhere.nrrd")
         field.press("Enter")
         user.press("ct", "loadCt")  # the field loses the focus in this very click
-        user.sees("ct", "no CT at nowhere.nrrd")
+        user.sees("ct", "no CT at session/nowhere.nrrd")  # a bare name is looked for in the session
