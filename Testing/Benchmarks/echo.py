@@ -3,7 +3,7 @@
     python -m Testing.Benchmarks.echo --worlds 300 --seed 7
 
 The recordings are drawn like those of the calibration, from each of its families (Testing/Studies/simulators), with other
-seeds, and from families that no network is fitted to (plain_lines, latency_lines; other recordings of them
+seeds, and from one that no network is fitted to (latency_lines; other recordings of it are among those that
 calibrate the stated quality). Depths are judged with the true speed of sound given.
 """
 
@@ -23,12 +23,12 @@ from ModuleUltrasoundLib.measurement.measure import EchoSettings, measure_lines
 
 from Testing.Studies.simulators import bench_lines
 from Testing.Studies.simulators.echo_lines import draw_world, simulate
-from Testing.Studies.simulators.families import HARD, SESSIONS, UNSEEN
+from Testing.Studies.simulators.families import HARD, SESSIONS, TEXTBOOK, UNSEEN
 
 Array = npt.NDArray[np.float64]
 FRAMES = 40
 SYMMETRIC = ("gauss", "ricker", "hann", "chirp", "symmetric")
-SIMULATORS = HARD | SESSIONS | UNSEEN
+SIMULATORS = HARD | SESSIONS | TEXTBOOK | UNSEEN
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from Testing.Studies.simulators.families import HARD, SESSIONS, UNSEEN
+from Testing.Studies.simulators.families import HARD, SESSIONS, TEXTBOOK, UNSEEN
 
-FAMILIES = HARD | SESSIONS | UNSEEN
+FAMILIES = HARD | SESSIONS | TEXTBOOK | UNSEEN
 
 
 @pytest.mark.parametrize("family", FAMILIES)

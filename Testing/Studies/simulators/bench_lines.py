@@ -154,6 +154,7 @@ def draw_bare(rng: np.random.Generator) -> Bench:
     return replace(
         draw_bench(rng),
         bare=True,
+        snr_db=float(rng.uniform(11, 60)),  # water takes nothing
         noise="white",
         bursts=0.0,
         spikes=0.0,

@@ -55,4 +55,5 @@ SESSIONS = _by_name(  # as they go on a head
     device_lines,
     sphere_lines,
 )
-UNSEEN = _by_name(plain_lines, latency_lines)  # no network is fitted to them
+TEXTBOOK = _by_name(plain_lines)  # as a textbook would write them in a page
+UNSEEN = _by_name(latency_lines)  # no network is fitted to them

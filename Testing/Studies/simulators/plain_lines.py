@@ -1,8 +1,7 @@
-"""A fourth family of simulated A-lines, as a textbook would write them in a page: on it the stated quality is calibrated.
+"""Simulated A-lines as a textbook would write them in a page.
 
-No network is fitted to these lines, so that what they say about the quality holds for lines from elsewhere. A Gaussian pulse,
-a delay line with strong multiples, one interface that follows the bone, filtered noise for speckle that ends at the bone, the
-inner table, white noise; the probe glides or jumps.
+A Gaussian pulse, a delay line with strong multiples, one interface that follows the bone, filtered noise for speckle that ends
+at the bone, the inner table, white noise that is as faint in each line as the SNR says; the probe glides or jumps.
 """
 
 from __future__ import annotations
