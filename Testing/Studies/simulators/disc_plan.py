@@ -15,7 +15,7 @@ from CranioNavLib.recording import Acquisition
 from CranioNavLib.rigid import rigid
 from scipy.signal import lfilter
 
-from Testing.Studies.simulators.units import InMicroseconds
+from Testing.Studies.simulators.units import InMicroseconds, ThroughScalp
 
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
@@ -49,7 +49,7 @@ NO_DELAY = DelayLine(0.0, 0.0, 0.0, False, 0.0)
 
 
 @dataclass(frozen=True)
-class Setup(InMicroseconds):
+class Setup(InMicroseconds, ThroughScalp):
     """What all lines of a recording share. Heights are over bone met squarely at the surface."""
 
     acquisition: Acquisition
@@ -88,11 +88,6 @@ class Setup(InMicroseconds):
     fill: float  # of the converter, by the typical bone
     bits: int
     left: bool  # codes are moved up to 16 bits
-
-    @property
-    def mm_us(self) -> float:
-        """Speed of sound in the scalp."""
-        return self.speed_m_s * 1e-3
 
     @property
     def wave_mm(self) -> float:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from CranioNavLib.recording import Acquisition
 from CranioNavLib.rigid import rigid
 
-from Testing.Studies.simulators.units import InMicroseconds
+from Testing.Studies.simulators.units import InMicroseconds, ThroughScalp
 
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
@@ -52,7 +52,7 @@ MATERIALS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Setup(InMicroseconds):
+class Setup(InMicroseconds, ThroughScalp):
     """What all lines of a recording share."""
 
     acquisition: Acquisition
@@ -74,11 +74,6 @@ class Setup(InMicroseconds):
     half_deg: float  # the bone's echo has lost 6 dB
     floor: float  # its diffuse echo over its specular one
     speckle: float  # RMS over an echo of height 1
-
-    @property
-    def mm_us(self) -> float:
-        """Speed of sound in the scalp."""
-        return self.speed_m_s * 1e-3
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.recording import Acquisition
 
+from Testing.Studies.simulators.units import ThroughScalp
+
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 Words = npt.NDArray[np.str_]
@@ -74,7 +76,7 @@ class Skull:
 
 
 @dataclass(frozen=True)
-class Setup:
+class Setup(ThroughScalp):
     """What all lines of a recording share."""
 
     acquisition: Acquisition
@@ -104,11 +106,6 @@ class Setup:
     @property
     def sampling_mhz(self) -> float:
         return self.acquisition.sampling_hz * 1e-6
-
-    @property
-    def mm_us(self) -> float:
-        """Speed of sound in the scalp."""
-        return self.speed_m_s * 1e-3
 
     @property
     def delay_us(self) -> float:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from CranioNavLib.recording import Acquisition
 from CranioNavLib.rigid import rigid
 
-from Testing.Studies.simulators.units import InMicroseconds
+from Testing.Studies.simulators.units import InMicroseconds, ThroughScalp
 
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
@@ -32,7 +32,7 @@ LEAST_LINES = 8
 
 
 @dataclass(frozen=True, eq=False)
-class World(InMicroseconds):
+class World(InMicroseconds, ThroughScalp):
     """What all lines of a recording share. Times in us, frequencies in MHz."""
 
     acquisition: Acquisition
@@ -63,11 +63,6 @@ class World(InMicroseconds):
     spikes: bool
     hot: bool  # the gain is too high
     bits: int
-
-    @property
-    def mm_us(self) -> float:
-        """Speed of sound in the scalp."""
-        return self.speed_m_s * 1e-3
 
 
 def decibel(level: float | Array) -> float | Array:

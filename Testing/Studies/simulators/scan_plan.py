@@ -14,6 +14,8 @@ from CranioNavLib.recording import Acquisition
 from CranioNavLib.rigid import rigid
 from scipy.signal import lfilter
 
+from Testing.Studies.simulators.units import ThroughScalp
+
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
@@ -40,7 +42,7 @@ POSE_MM, POSE_DEG = 0.08, 0.1  # what the tracker adds
 
 
 @dataclass(frozen=True, eq=False)
-class Setup:
+class Setup(ThroughScalp):
     """What is drawn before the hand moves."""
 
     without: str  # a recording without bone: soft, air, gel
@@ -54,11 +56,6 @@ class Setup:
     snr_of: str
     depth_mm: float  # typical
     line_s: float
-
-    @property
-    def mm_us(self) -> float:
-        """Speed of sound in the scalp."""
-        return self.speed_m_s * 1e-3
 
     @property
     def loss_db_mm(self) -> float:

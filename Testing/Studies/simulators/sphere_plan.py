@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.recording import Acquisition
 
-from Testing.Studies.simulators.units import InMicroseconds
+from Testing.Studies.simulators.units import InMicroseconds, ThroughScalp
 
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
@@ -53,7 +53,7 @@ MATERIALS = (  # m/s, MRayl, dB/cm/MHz
 
 
 @dataclass(frozen=True)
-class Fit(InMicroseconds):
+class Fit(InMicroseconds, ThroughScalp):
     """What has to go together: the head, the transducer and the delay line."""
 
     acquisition: Acquisition
@@ -63,11 +63,6 @@ class Fit(InMicroseconds):
     formalin: bool
     sweeps: bool
     depths_mm: tuple[float, ...]  # of the places of a whole session
-
-    @property
-    def mm_us(self) -> float:
-        """Speed of sound in the scalp."""
-        return self.speed_m_s * 1e-3
 
     @property
     def loss_db_mm(self) -> float:

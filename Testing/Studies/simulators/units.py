@@ -1,4 +1,4 @@
-"""Frequencies of a simulated set-up in the units that its lines are made in: microseconds and megahertz."""
+"""A simulated set-up in the units that its lines are made in: microseconds, megahertz and millimetres."""
 
 from __future__ import annotations
 
@@ -19,3 +19,14 @@ class InMicroseconds:
     def sampling_mhz(self) -> float:
         """Samples a microsecond."""
         return self.acquisition.sampling_hz * 1e-6
+
+
+class ThroughScalp:
+    """What has a speed of sound in the scalp."""
+
+    speed_m_s: float
+
+    @property
+    def mm_us(self) -> float:
+        """Speed of sound in the scalp."""
+        return self.speed_m_s * 1e-3
