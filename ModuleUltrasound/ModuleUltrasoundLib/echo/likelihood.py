@@ -85,12 +85,13 @@ def judge_echoes(found: Found, likelihood: Likelihood, runs: npt.NDArray[np.int6
 
 
 def _judge_together(found: Found, likelihood: Likelihood, runs: npt.NDArray[np.int64]) -> tuple[Array, Array]:
-    scores, echoes = found.scores, Echoes.of(found.depths_mm, runs)
+    scores, echoes, possible = found.scores, Echoes.of(found.depths_mm, runs), found.possible
     shared = shared_features(found, scores, runs, echoes)
     for turn, committee in enumerate(likelihood.turns[1:]):
         if turn:
             shared = shared_features(found, scores, runs, echoes)
-        scores = committee.scores(np.concatenate([found.features, shared], axis=-1))
+        scores = np.zeros(possible.shape)
+        scores[possible] = committee.scores(np.concatenate([found.features[possible], shared[possible]], axis=-1))
     chance, _ = probabilities(scores, found.possible)
     return chance, shared
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from CranioNavLib.rigid import Array
 
 WEIGHTS = Path(__file__).with_name("weights.json")  # written by Testing/Studies/calibrate_echo.py
-ROWS = 256  # lines whose scores are worked out at once: the layers stay in the processor's cache
+ROWS = 1024  # candidates whose scores are worked out at once: the layers stay in the processor's cache
 
 Weights = npt.NDArray[np.float32]
 
@@ -25,17 +25,18 @@ class Network:
     layers: tuple[tuple[Weights, Weights], ...]  # weights (in, out) and biases (out,)
 
     def scores(self, features: npt.NDArray[np.floating[Any]]) -> Array:
-        """Log-odds (n, K) of features (n, K, D)."""
-        values = np.empty(features.shape[:-1], dtype=float)
-        for start in range(0, len(features), ROWS):
-            x = np.asarray(features[start : start + ROWS], dtype=np.float32)
+        """Log-odds (...) of features (..., D)."""
+        rows = features.reshape(-1, features.shape[-1])  # one tall product is twice as fast as one a line
+        values = np.empty(len(rows))
+        for start in range(0, len(rows), ROWS):
+            x = np.asarray(rows[start : start + ROWS], dtype=np.float32)
             for weights, biases in self.layers[:-1]:
                 x = np.asarray(x @ weights, dtype=np.float32)
                 x += biases
                 np.maximum(x, 0, out=x)  # cheaper than a smooth kink, and as good
             weights, biases = self.layers[-1]
-            values[start : start + ROWS] = (x @ weights + biases)[..., 0]
-        return values
+            values[start : start + ROWS] = (x @ weights + biases)[:, 0]
+        return values.reshape(features.shape[:-1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +49,7 @@ class Committee:
     members: tuple[Network, ...]
 
     def scores(self, features: npt.NDArray[np.floating[Any]]) -> Array:
-        """Log-odds (n, K) of features (n, K, D)."""
+        """Log-odds (...) of features (..., D)."""
         return np.asarray(sum(member.scores(features) for member in self.members) / len(self.members))
 
 

@@ -35,7 +35,7 @@ class Found:
     forerun: Forerun
     forerun_phases: Array  # (n,) rad; 0 where no forerun echo was found
     features: Array  # (n, K, D)
-    scores: Array  # (n, K) of `rank`; 0 without it
+    scores: Array  # (n, K) of `rank`; 0 without it, and where bone is not looked for
     depths_mm: Array  # (n, K) at the speed of sound given
     possible: npt.NDArray[np.bool_]  # (n, K) where bone is looked for
     windows: Complexes  # (n, KEPT, W) complex envelope around the first candidates, for the time of flight
@@ -76,7 +76,7 @@ def check_length(recording: Recording, speed_m_s: float, least_depth_mm: float) 
         )
 
 
-Rank = Callable[[Array], Array]  # features (n, K, D) -> scores (n, K)
+Rank = Callable[[Array], Array]  # features (m, D) of the candidates that may be bone -> scores (m,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,9 +174,11 @@ def _search_batch(lines: npt.NDArray[np.int16], places: npt.NDArray[np.int64] | 
         at = np.rint(without_nan(candidates.delays_s + forerun.skin_s[:, None], -1.0) * envelopes.rate_hz).astype(np.int64)
         candidates = replace(candidates, static=believed(likeness(envelopes, pattern, at), candidates.amplitudes))
     features = line_features(candidates, forerun, skin, acquisition.transducer_hz, search.speed_m_s)
-    scores = np.zeros(features.shape[:2]) if rank is None else rank(features)
+    scores = np.zeros(features.shape[:2])
     if rank is not None:
-        order = np.argsort(-np.where(search.possible(candidates.delays_s), scores, -np.inf), axis=1, kind="stable")
+        possible = search.possible(candidates.delays_s)
+        scores[possible] = rank(features[possible])
+        order = np.argsort(-np.where(possible, scores, -np.inf), axis=1, kind="stable")
         candidates, scores, features = reorder(candidates, order), pick(scores, order), pick(features, order)
     return Found(
         candidates,
