@@ -5,9 +5,9 @@
 The recordings come from families of simulated lines that share no model (Testing/Studies/simulators). Four are drawn to be hard,
 one is a water bath, where there is bone and nothing else, one is as a textbook has it, and seventeen go as a palpation session
 does: the hand comes down, searches the perpendicular, holds, lifts. Each recording has its own pulse, transducer, forerun,
-tissue, noise and clutter. A tenth of the recordings is kept out of the fit; they judge it, and on them and on families that
-nothing is fitted to (UNSEEN) the stated quality is mapped to the share of depths that were right. The same seed gives the same
-table; the one in the repository says in its note what it was fitted to.
+tissue, noise and clutter. A tenth of the recordings is kept out of the fit; they judge it. On those of them that are as in use,
+and on families that nothing is fitted to (UNSEEN), the stated quality is mapped to the share of depths that were right. The same
+seed gives the same table; the one in the repository says in its note what it was fitted to.
 """
 
 from __future__ import annotations
@@ -24,7 +24,15 @@ import numpy as np
 import numpy.typing as npt
 from CranioNavLib.recording import Recording
 from ModuleUltrasoundLib.echo.likelihood import shared_features
-from ModuleUltrasoundLib.echo.network import WEIGHTS, Committee, Likelihood, probabilities, write_likelihood
+from ModuleUltrasoundLib.echo.network import (
+    DOUBTFUL,
+    WEIGHTS,
+    Calibration,
+    Committee,
+    Likelihood,
+    probabilities,
+    write_likelihood,
+)
 from ModuleUltrasoundLib.echo.search import Found, search_lines
 from ModuleUltrasoundLib.measurement.measure import DEFAULT_SETTINGS, EchoSettings, measure_lines, places_of, stays
 from ModuleUltrasoundLib.measurement.quality import TOLERANCE_MM
@@ -41,6 +49,7 @@ FAMILIES = (
     | dict.fromkeys(sorted(SESSIONS.keys() - {"session_lines"}), 0.5)
     | dict.fromkeys(TEXTBOOK, 0.5)
 )
+AS_IN_USE = SESSIONS | TEXTBOOK | UNSEEN  # what the quality is calibrated on
 MEMBERS = 3  # networks of a turn: one alone is better or worse by chance (lines without bone accepted: 0.5 to 0.9 %)
 TURNS = 2  # a line by itself, then with the recording around it; a third adds little and costs a tenth of the time
 LABEL_MM = 0.4  # a candidate this near to the bone stands for it
@@ -169,30 +178,45 @@ def fit_turns(worlds: list[World], rng: np.random.Generator, epochs: int, jobs: 
     return tuple(turns)
 
 
-def calibrate_quality(held: list[Simulated], likelihood: Likelihood) -> tuple[Array, Array]:
-    """Knots of the monotone map from the likelihood's quality to the share of depths within the tolerance.
+def calibrate_quality(held: list[Simulated], turns: tuple[Committee, ...]) -> Calibration:
+    """What the committees' quality means: a monotone map to the share of depths within the tolerance, and the doubtful's share.
 
     A new simulator, or a patient, is one more family: what is expected of it is the mean over the families of their shares,
-    however many lines each has in a bin. Short recordings are left out.
+    however many lines each has in a bin. Short recordings are left out, and so are families that do not go as a session does:
+    the lines they were drawn to be hard with say nothing of how often a line in use is right.
     """
-    edges = np.concatenate([[0.0], np.linspace(0.05, 0.95, KNOTS - 3), [0.98, 0.995, 1.0 + 1e-9]])
-    families = sorted({one.family for one in held})
-    sums = np.zeros((len(families), 3, len(edges) - 1))  # lines, stated, right
+    straight = Calibration(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+    stated: dict[str, list[Array]] = {}
+    right: dict[str, list[Array]] = {}
     for one in held:
-        if len(one.true_mm) < LEAST_LINES:
+        if len(one.true_mm) < LEAST_LINES or one.family not in AS_IN_USE:
             continue
-        found = measure_lines(one.recording, EchoSettings(speed_of_sound_m_s=one.speed_m_s), likelihood)
-        right = np.abs(np.nan_to_num(found.depths_mm - one.true_mm, nan=np.inf)) < TOLERANCE_MM
-        which = np.digitize(found.qualities, edges) - 1
-        for row, values in enumerate((np.ones(len(right)), found.qualities, right)):
-            sums[families.index(one.family), row] += np.bincount(which, values, len(edges) - 1)
+        settings = EchoSettings(speed_of_sound_m_s=one.speed_m_s)
+        found = measure_lines(one.recording, settings, Likelihood(turns, straight))
+        stated.setdefault(one.family, []).append(found.qualities)
+        right.setdefault(one.family, []).append(np.abs(np.nan_to_num(found.depths_mm - one.true_mm, nan=np.inf)) < TOLERANCE_MM)
+    lines = [(np.concatenate(stated[family]), np.concatenate(right[family])) for family in sorted(stated)]
+    middles, shares, some = typical_shares(lines, np.array([0.0, *np.linspace(0.05, 0.95, KNOTS - 3), 0.98, 0.995, 1 + 1e-9]))
+    fine = Calibration(*monotone(middles[some], shares[some]))
+    mapped = [(fine.probability(one), of_one) for one, of_one in lines]
+    _, levels, _ = typical_shares(mapped, np.array([0.0, *DOUBTFUL, 1 + 1e-9]))
+    return replace(fine, doubtful=float(levels[1]))
+
+
+def typical_shares(lines: list[tuple[Array, Array]], edges: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+    """Mean stated (b,), mean over the families of the share that was right (b,), and whether there is any line (b,).
+
+    `lines` holds (stated, right) of each family; the bins lie between `edges` (b + 1,).
+    """
+    sums = np.zeros((len(lines), 3, len(edges) - 1))  # lines, stated, right
+    for row, (stated, right) in enumerate(lines):
+        which = np.digitize(stated, edges) - 1
+        sums[row] = [np.bincount(which, values, len(edges) - 1) for values in (np.ones(len(stated)), stated, right)]
     print("lines, stated, right of each family", *np.round(sums / np.maximum(sums[:, :1], 1e-9), 3)[:, 1:], sep="\n")
     pooled = sums.sum(axis=0)
     typical = pooled[2] / np.maximum(pooled[0], 1e-9)
     shares = (sums[:, 2] + FEW * typical) / (sums[:, 0] + FEW)  # a few lines say little of a family
-    stated = pooled[1] / np.maximum(pooled[0], 1e-9)
-    some = pooled[0] > 0
-    return monotone(stated[some], shares.mean(axis=0)[some])
+    return pooled[1] / np.maximum(pooled[0], 1e-9), shares.mean(axis=0), pooled[0] > 0
 
 
 def monotone(stated: Array, right: Array) -> tuple[Array, Array]:
@@ -235,9 +259,8 @@ def main() -> None:
         judge(turn, turns[: turn + 1], held, tests)
     count = options.worlds // HELD_OUT
     unseen = [one for name in UNSEEN for one in family_of(name, options.seed * 1_000_000, count, options.cache, options.jobs)]
-    straight = np.array([0.0, 1.0])
-    quality = calibrate_quality(held + unseen, Likelihood(turns, (straight, straight)))
-    print("quality", *quality, sep="\n")
+    quality = calibrate_quality(held + unseen, turns)
+    print("quality", quality.stated, quality.right, quality.doubtful, sep="\n")
     counts = ", ".join(f"{int(share * options.worlds)} {family}" for family, share in FAMILIES.items())
     note = f"simulated recordings, seed {options.seed}: {counts}"
     write_likelihood(WEIGHTS, Likelihood(turns, quality), note)

@@ -2,11 +2,12 @@
 
 With a forerun echo in the line the question does not arise: both echoes share the pulse, and their distance is free of it.
 Without one, depth counts from the transmit pulse, and a peak picked on a pulse that rises at the arrival is late by half a
-cycle to two cycles (0.1 to 0.4 mm). Two things tell: a main bang that shows the very pulse of the echoes, and the shape of
-the pulse: a damped oscillation rises faster than it decays, and has its origin at its onset; a symmetric pulse has its
-origin in its middle. Where neither tells, the delay is taken as zero; where the shape alone tells, most of it is taken.
-What is wrong in it is common to all points of the recording (an offset of depth that registration can estimate), so it is
-not part of their covariances.
+cycle to two cycles (0.1 to 0.4 mm). A main bang that shows the very pulse of the echoes tells how much. Else the shape of the
+pulse does, in part: a damped oscillation rises faster than it decays, and has its origin near its onset. Many a pulse looks
+symmetric that is not: each stage of transducer, receiver and tissue rounds it. It may count from its middle, as in many
+simulators, or from the firing, as a device does that knows nothing of its transducer's delay: half of that delay is taken
+then, so that either way at most half is left wrong. What is wrong in it is common to all points of the recording (an offset
+of depth that registration can estimate), so it is not part of their covariances.
 """
 
 from __future__ import annotations
@@ -24,9 +25,11 @@ SMEAR_CYCLES = 2.3548 / (2 * np.pi * BAND_WIDTH)  # standard deviation in time o
 GAMMA_SHAPES = (1.0, 1.5, 2.0, 3.0, 4.0)  # of t^(k-1) exp(-t/theta): abrupt onset to slow build-up
 GAMMA_SCALES = tuple(np.geomspace(0.1, 2.5, 18))  # theta, cycles
 WIDTHS = tuple(np.geomspace(0.4, 2.5, 30))  # standard deviation of a symmetric pulse, cycles
-# Nothing in a recording tells whether its zero is the firing or the peak of what was fired. Two thirds of the delay: of at most
-# 0.4 mm a third is left wrong if it is the firing, two thirds if it is the peak
+# Nothing in a recording tells whether its zero is the firing or the peak of what was fired. Two thirds of a damped pulse's delay:
+# of at most 0.4 mm a third is left wrong if it is the firing, two thirds if it is the peak
 COUNTED = 2 / 3
+COUNTED_IF_SYMMETRIC = 1 / 2  # nor whether such a pulse is late at all
+RISE, LONGEST_RISE = 3**0.5, 1.6  # peak of t^3 exp(-t/theta) behind its onset, in standard deviations about the peak; cycles
 CLEAR = 0.45  # residual of the causal shape over that of the symmetric one: below, the pulse is causal
 UNDECIDED = 0.8  # above, symmetric; between them the delay fades
 GOOD_FIT = 0.06  # largest RMS residual of a shape that explains the pulse
@@ -55,7 +58,7 @@ def _shapes(step_cycles: float) -> tuple[Array, Array, Array]:
 
 
 def delay_from_shape(pulse: Pulse, transducer_hz: float) -> float:
-    """Delay (s) of the peak behind the onset if the pulse is clearly a damped oscillation, else 0."""
+    """What is counted of the delay (s) of the peak behind the onset, by the shape of the pulse; 0 while it is not known."""
     if pulse.lines < LEAST_LINES:
         return 0.0
     magnitude = np.abs(pulse.values)
@@ -65,11 +68,11 @@ def delay_from_shape(pulse: Pulse, transducer_hz: float) -> float:
     rms = [np.sqrt((weight * (shapes - magnitude) ** 2).sum(axis=1) / weight.sum()) for shapes in (causal, symmetric)]
     best = int(rms[0].argmin())
     ratio = rms[0][best] / max(float(rms[1].min()), 1e-6)
-    if rms[0][best] > GOOD_FIT:
-        return 0.0
-    share = float(np.clip((UNDECIDED - ratio) / (UNDECIDED - CLEAR), 0, 1))
+    share = float(np.clip((UNDECIDED - ratio) / (UNDECIDED - CLEAR), 0, 1)) if rms[0][best] < GOOD_FIT else 0.0
     near = rms[0] < 1.3 * rms[0][best] + 0.003  # shapes that explain it about as well: their mean delay
-    return COUNTED * share * max(float(delays[near].mean()), 0.0) / transducer_hz
+    damped = COUNTED * max(float(delays[near].mean()), 0.0)
+    symmetric = COUNTED_IF_SYMMETRIC * min(RISE * WIDTHS[int(rms[1].argmin())], LONGEST_RISE)
+    return (share * damped + (1 - share) * symmetric) / transducer_hz
 
 
 def delay_from_bang(bang: npt.NDArray[np.complex128], pulse: Pulse, transducer_hz: float) -> float:

@@ -14,7 +14,7 @@ from CranioNavLib.sequence_metafile import Recording
 from ModuleUltrasoundLib.echo.features import NAMES
 from ModuleUltrasoundLib.echo.lean import median, without_nan
 from ModuleUltrasoundLib.echo.likelihood import SHARED_NAMES, judge_echoes
-from ModuleUltrasoundLib.echo.network import Likelihood, learnt
+from ModuleUltrasoundLib.echo.network import Calibration, Likelihood, learnt
 from ModuleUltrasoundLib.echo.onset import pulse_delay
 from ModuleUltrasoundLib.echo.search import Found, search_lines
 from ModuleUltrasoundLib.echo.timing import time_echoes
@@ -46,7 +46,7 @@ class EchoSettings(Parameters):
     least_depth_mm: Annotated[float, Limits(0, 20), "no bone is looked for above this depth"] = 1.8
     most_depth_mm: Annotated[float, Limits(2, 60), "no bone is looked for below this depth"] = 16.0
     # chosen on simulators by other hands, half of them not fitted to: a higher one costs points and makes few of them righter
-    quality_gate: Annotated[float, Limits(0, 1), "frames below this quality are not points"] = 0.93
+    quality_gate: Annotated[float, Limits(0, 1), "frames below this quality are not points"] = 0.95
     beam_width_mm: Annotated[float, Limits(0, 10), "-6 dB width of the beam"] = 1.2
     tilt_sd_deg: Annotated[float, Limits(0, 20), "SD of the angle between beam and bone normal"] = 2.0
 
@@ -166,13 +166,13 @@ def assemble(
     sd_s: Array,
     runs: npt.NDArray[np.int64],
     shared: Array,
-    calibration: tuple[Array, Array],
+    calibration: Calibration,
 ) -> LineMeasurements:
     """The measurements of a recording whose echoes have been judged and timed."""
     rows, speed = np.arange(len(chance)), settings.speed_of_sound_m_s
     depth = np.where(found.possible[rows, best], found.depths_mm[rows, best] + shift_s * 500 * speed, np.nan)
     sd_mm = sd_s * 500 * speed
-    quality = np.interp(quality_of(found.depths_mm, best, chance, sd_mm), *calibration)
+    quality = calibration.probability(quality_of(found.depths_mm, best, chance, sd_mm))
     ok = np.array([status == "OK" for status in recording.statuses], dtype=bool)
     poses = np.where(ok[:, None, None], recording.probe_to_reference, np.nan)
     positions, beams = bone_positions(poses, depth, recording.acquisition.forerun_length_mm)

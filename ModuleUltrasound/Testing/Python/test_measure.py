@@ -7,7 +7,7 @@ from CranioNavLib.errors import InputError
 from CranioNavLib.rigid import rigid_from_vector
 from CranioNavLib.sequence_metafile import Acquisition, Recording
 from ModuleUltrasoundLib.echo import likelihood
-from ModuleUltrasoundLib.echo.network import learnt
+from ModuleUltrasoundLib.echo.network import Calibration, learnt
 from ModuleUltrasoundLib.measurement.measure import EchoSettings, measure_lines, several_spots, stays
 
 SPEED = 1500.0
@@ -260,18 +260,20 @@ def test_scalp_of_one_depth_everywhere_is_no_artefact(depth):
 
 
 def test_calibrated_quality_rises_with_the_likelihoods():
-    likelihood, stated = learnt().quality
+    quality = learnt().quality
+    likelihood, stated = quality.stated, quality.right
     assert likelihood[0] == stated[0] == 0
     assert likelihood[-1] == 1
     assert (np.diff(likelihood) > 0).all()
     assert (np.diff(stated) >= 0).all()
     assert 0.99 < stated[-1] <= 1
+    assert (np.diff(quality.probability(np.linspace(0, 1, 1001))) >= 0).all()
 
 
 def test_quality_is_mapped_by_the_likelihood_that_is_given():
     recording = record(np.random.default_rng(12), np.full(12, 6.0), SET_UPS["5 MHz, polystyrene"])
-    halved = replace(learnt(), quality=(np.array([0.0, 1.0]), np.array([0.0, 0.5])))
-    straight = replace(learnt(), quality=(np.array([0.0, 1.0]), np.array([0.0, 1.0])))
+    halved = replace(learnt(), quality=Calibration(np.array([0.0, 1.0]), np.array([0.0, 0.5])))
+    straight = replace(learnt(), quality=Calibration(np.array([0.0, 1.0]), np.array([0.0, 1.0])))
     one, other = (measure_lines(recording, likelihood=likelihood).qualities for likelihood in (halved, straight))
     assert one == pytest.approx(other / 2)
 
