@@ -23,12 +23,12 @@ from ModuleUltrasoundLib.measurement.measure import EchoSettings, measure_lines
 
 from Testing.Studies.simulators import bench_lines
 from Testing.Studies.simulators.echo_lines import draw_world, simulate
-from Testing.Studies.simulators.families import HARD, SESSIONS, TEXTBOOK, UNSEEN
+from Testing.Studies.simulators.families import HARD, OFF_BONE, SESSIONS, TEXTBOOK, UNSEEN
 
 Array = npt.NDArray[np.float64]
 FRAMES = 40
 SYMMETRIC = ("gauss", "ricker", "hann", "chirp", "symmetric")
-SIMULATORS = HARD | SESSIONS | TEXTBOOK | UNSEEN
+SIMULATORS = HARD | SESSIONS | TEXTBOOK | OFF_BONE | UNSEEN
 
 
 @dataclass(frozen=True, eq=False)

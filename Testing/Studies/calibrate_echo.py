@@ -3,11 +3,12 @@
     python -m Testing.Studies.calibrate_echo --worlds 4400 --seed 30 [--cache DIR]
 
 The recordings come from families of simulated lines that share no model (Testing/Studies/simulators). Four are drawn to be hard,
-one is a water bath, where there is bone and nothing else, one is as a textbook has it, and seventeen go as a palpation session
-does: the hand comes down, searches the perpendicular, holds, lifts. Each recording has its own pulse, transducer, forerun,
-tissue, noise and clutter. A tenth of the recordings is kept out of the fit; they judge it. On those of them that are as in use,
-and on families that nothing is fitted to (UNSEEN), the stated quality is mapped to the share of depths that were right. The same
-seed gives the same table; the one in the repository says in its note what it was fitted to.
+one is a water bath, where there is bone and nothing else, one is as a textbook has it, in one the probe meets no bone at all,
+and seventeen go as a palpation session does: the hand comes down, searches the perpendicular, holds, lifts. Each recording has
+its own pulse, transducer, forerun, tissue, noise and clutter. A tenth of the recordings is kept out of the fit; they judge it.
+On those of them that are as in use, and on families that nothing is fitted to (UNSEEN), the stated quality is mapped to the
+share of depths that were right. The same seed gives the same table; the one in the repository says in its note what it was
+fitted to.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from ModuleUltrasoundLib.measurement.quality import TOLERANCE_MM
 
 from Testing.Studies.fit_network import Lines, fit, joined
 from Testing.Studies.simulators import bench_lines, echo_lines, tissue_lines
-from Testing.Studies.simulators.families import HARD, SESSIONS, TEXTBOOK, UNSEEN
+from Testing.Studies.simulators.families import HARD, OFF_BONE, SESSIONS, TEXTBOOK, UNSEEN
 
 Array = npt.NDArray[np.float64]
 # Recordings of each family, of the number asked for
@@ -48,8 +49,9 @@ FAMILIES = (
     | {"bare_lines": 0.75, "session_lines": 1.0}
     | dict.fromkeys(sorted(SESSIONS.keys() - {"session_lines"}), 0.5)
     | dict.fromkeys(TEXTBOOK, 0.5)
+    | dict.fromkeys(OFF_BONE, 0.3)
 )
-AS_IN_USE = SESSIONS | TEXTBOOK | UNSEEN  # what the quality is calibrated on
+AS_IN_USE = SESSIONS | TEXTBOOK | OFF_BONE | UNSEEN  # what the quality is calibrated on
 MEMBERS = 3  # networks of a turn: one alone is better or worse by chance (lines without bone accepted: 0.5 to 0.9 %)
 TURNS = 2  # a line by itself, then with the recording around it; a third adds little and costs a tenth of the time
 LABEL_MM = 0.4  # a candidate this near to the bone stands for it
@@ -97,7 +99,7 @@ def simulate_world(family: str, seed: int) -> Simulated:
     elif family in SESSIONS:
         recording, truth, _ = SESSIONS[family].simulate(rng, max(frames, 8) * 3 // 2)
     else:
-        recording, truth, _ = (HARD | TEXTBOOK | UNSEEN)[family].simulate(rng, frames * 3 // 2)
+        recording, truth, _ = (HARD | TEXTBOOK | OFF_BONE | UNSEEN)[family].simulate(rng, frames * 3 // 2)
     assumed = truth.speed_m_s if rng.random() < 0.8 else float(rng.uniform(1450, 1630))
     return Simulated(family, recording, truth.depth_mm, truth.tilt_deg, truth.snr_db, truth.speed_m_s, assumed)
 

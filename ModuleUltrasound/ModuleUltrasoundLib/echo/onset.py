@@ -72,7 +72,7 @@ def delay_from_shape(pulse: Pulse, transducer_hz: float) -> float:
     near = rms[0] < 1.3 * rms[0][best] + 0.003  # shapes that explain it about as well: their mean delay
     damped = COUNTED * max(float(delays[near].mean()), 0.0)
     symmetric = COUNTED_IF_SYMMETRIC * min(RISE * WIDTHS[int(rms[1].argmin())], LONGEST_RISE)
-    return (share * damped + (1 - share) * symmetric) / transducer_hz
+    return float((share * damped + (1 - share) * symmetric) / transducer_hz)
 
 
 def delay_from_bang(bang: npt.NDArray[np.complex128], pulse: Pulse, transducer_hz: float) -> float:

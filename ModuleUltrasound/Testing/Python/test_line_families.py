@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from Testing.Studies.simulators.families import HARD, SESSIONS, TEXTBOOK, UNSEEN
+from Testing.Studies.simulators.families import HARD, OFF_BONE, SESSIONS, TEXTBOOK, UNSEEN
 
-FAMILIES = HARD | SESSIONS | TEXTBOOK | UNSEEN
+FAMILIES = HARD | SESSIONS | TEXTBOOK | OFF_BONE | UNSEEN
 
 
 @pytest.mark.parametrize("family", FAMILIES)

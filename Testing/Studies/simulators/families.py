@@ -15,6 +15,7 @@ from Testing.Studies.simulators import (
     kirchhoff_lines,
     latency_lines,
     layer_lines,
+    lifted_lines,
     page_lines,
     piston_lines,
     plain_lines,
@@ -56,4 +57,5 @@ SESSIONS = _by_name(  # as they go on a head
     sphere_lines,
 )
 TEXTBOOK = _by_name(plain_lines)  # as a textbook would write them in a page
+OFF_BONE = _by_name(lifted_lines)  # the probe meets no bone at all
 UNSEEN = _by_name(latency_lines)  # no network is fitted to them
