@@ -49,7 +49,7 @@ FAMILIES = (
     | {"bare_lines": 0.75, "session_lines": 1.0}
     | dict.fromkeys(sorted(SESSIONS.keys() - {"session_lines"}), 0.5)
     | dict.fromkeys(TEXTBOOK, 0.5)
-    | dict.fromkeys(OFF_BONE, 0.3)
+    | dict.fromkeys(OFF_BONE, 0.15)
 )
 AS_IN_USE = SESSIONS | TEXTBOOK | OFF_BONE | UNSEEN  # what the quality is calibrated on
 MEMBERS = 3  # networks of a turn: one alone is better or worse by chance (lines without bone accepted: 0.5 to 0.9 %)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import scipy
 from CranioNavLib.rigid import Array
 
-from ModuleUltrasoundLib.echo.candidates import DECIBEL, Candidates
+from ModuleUltrasoundLib.echo.candidates import DECIBEL
 from ModuleUltrasoundLib.echo.lean import median, product, without_nan
 from ModuleUltrasoundLib.echo.network import Likelihood, probabilities
 from ModuleUltrasoundLib.echo.search import Found
@@ -31,6 +31,9 @@ LEAST_AT_PLACE = 0.05  # of the lines from a place: a smaller share is chance
 BLUR_STEP = 64  # bins: maps are of many sizes, matrices for them of a few
 USUAL_MM = 1.2  # the scalp of a head is about as thick from place to place
 SURE = 0.85
+# Attenuation of scalp is 0.3 to 2.6 dB/cm/MHz in the literature; their geometric mean is the usual one
+LEAST_FADING, USUAL_FADING = 0.3, 0.9  # dB/cm/MHz
+FADING_WEIGHT = 30.0  # mm^2: as much as ten lines tell whose depths have a standard deviation of 1.7 mm
 LEAST_FOR_SHARED = 3  # lines with a likely bone before anything is learnt from the recording
 STRETCH, AROUND = 112, 8  # lines of a glide judged together, and lines on each side that are looked at with them
 
@@ -108,7 +111,7 @@ def shared_features(found: Found, scores: Array, runs: npt.NDArray[np.int64], ec
         return np.zeros((*valid.shape, len(SHARED_NAMES)), dtype=np.float32)
     echoes = echoes or Echoes.of(depth_mm, runs)
     chance, none = probabilities(scores, found.possible)
-    strength, strength_known, slope = relative_strength(candidates, chance, depth_mm)
+    strength, strength_known, slope = relative_strength(candidates.amplitudes, chance, depth_mm, found.carrier_hz * 1e-6)
     polarity, polarity_known = relative_polarity(candidates.phases - found.forerun_phases[:, None], chance)
     near, far = Neighbours.within(runs, REACH), Neighbours.within(runs, FAR_REACH)
     likely = DepthMap.of(chance, depth_mm)
@@ -285,25 +288,28 @@ class Echoes:
         return behind / (self.at_place + LEAST_AT_PLACE)
 
 
-def relative_strength(candidates: Candidates, chance: Array, depth_mm: Array) -> tuple[Array, float, float]:
-    """Level of each candidate over what a bone of its depth shows in this recording, in units of 15 dB.
+def relative_strength(amplitudes: Array, chance: Array, depth_mm: Array, carrier_mhz: float) -> tuple[Array, float, float]:
+    """Level of each candidate (n, K) over what a bone of its depth shows in this recording, in units of 15 dB.
 
     The bone's level falls with depth by the tissue's attenuation: a straight line through the likely bones of all lines,
-    its slope shrunk to none. Also how far the line is known (0 to 1), and its slope (dB/mm).
+    its slope shrunk to that of usual tissue and never less than that of the clearest. So a layer at half the depth of the bone
+    elsewhere is weak for a bone there, even if it is as strong. Also how far the line is known (0 to 1), and its slope (dB/mm).
     """
-    level = DECIBEL * np.log(np.maximum(candidates.amplitudes, 1e-9))
+    level = DECIBEL * np.log(np.maximum(amplitudes, 1e-9))
     best = chance.argmax(axis=1)
     rows = np.arange(len(chance))
     weight = np.where(chance[rows, best] > 0.5, chance[rows, best], 0.0)
     if (weight > 0).sum() < LEAST_FOR_SHARED:
         return np.zeros(level.shape), 0.0, 0.0
     y, x = np.nan_to_num(level[rows, best]), np.nan_to_num(depth_mm[rows, best])
+    usual, least = (-0.2 * one * carrier_mhz for one in (USUAL_FADING, LEAST_FADING))  # dB/mm of depth, there and back
     slope, middle_x, middle_y = 0.0, 0.0, 0.0
     for _ in range(3):
         total = weight.sum() + 1e-9
         middle_x, middle_y = float((weight * x).sum() / total), float((weight * y).sum() / total)
         spread = (weight * (x - middle_x) ** 2).sum()
-        slope = float(np.clip((weight * (x - middle_x) * (y - middle_y)).sum() / (spread + 30.0), -5.0, 0.0))
+        along = (weight * (x - middle_x) * (y - middle_y)).sum()
+        slope = float(np.clip((along + FADING_WEIGHT * usual) / (spread + FADING_WEIGHT), -5.0, least))
         off = y - middle_y - slope * (x - middle_x)
         # tilted lines are weak: the upper part counts, so weak ones lose weight faster
         weight = np.where(chance[rows, best] > 0.5, chance[rows, best], 0.0) / (1 + (np.where(off < 0, off / 6, off / 12)) ** 2)

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from ModuleUltrasoundLib.echo.likelihood import DepthMap, Echoes, Neighbours, contact, relative_polarity
+from ModuleUltrasoundLib.echo.likelihood import DepthMap, Echoes, Neighbours, contact, relative_polarity, relative_strength
 
 
 def test_polarity_is_that_of_the_likely_bones_and_silent_when_they_disagree():
@@ -12,6 +12,25 @@ def test_polarity_is_that_of_the_likely_bones_and_silent_when_they_disagree():
     assert known > 0.9
     random = np.random.default_rng(1).uniform(0, 2 * np.pi, (30, 2))
     assert relative_polarity(random, chance)[1] < 0.1
+
+
+def test_layer_as_strong_as_the_bone_behind_so_much_tissue_is_too_weak_for_a_bone():
+    depth = np.column_stack([np.linspace(8, 10, 20), np.full(20, 3.0)])
+    strength, known, _ = relative_strength(np.full((20, 2), 100.0), np.tile([0.95, 0.02], (20, 1)), depth, 5.0)
+    assert known == 1
+    at_least_db = 0.2 * 0.3 * 5 * 6  # the clearest scalp, 6 mm of it, there and back
+    assert (15 * strength[:, 1] < -at_least_db + 0.1).all()
+    assert np.abs(15 * strength[:, 0]).max() < 2
+
+
+@pytest.mark.parametrize("fading", [0.6, 1.2, 2.4])  # dB/cm/MHz
+def test_bone_s_fading_with_depth_is_read_from_the_recording(fading):
+    rng = np.random.default_rng(2)
+    depth = rng.uniform(3, 13, (60, 1))
+    amplitude = 1000 * 10 ** (-0.2 * fading * 5 * depth / 20 + rng.normal(0, 0.05, (60, 1)))
+    strength, known, slope = relative_strength(amplitude, np.full((60, 1), 0.9), depth, 5.0)
+    assert (known, slope) == (1, pytest.approx(-0.2 * fading * 5, rel=0.15))
+    assert np.abs(strength).max() < 0.4
 
 
 def test_neighbours_of_the_same_stay_support_one_depth():
