@@ -45,7 +45,7 @@ class EchoSettings(Parameters):
     # soft tissue over bone is 2 to 15 mm thick in the chapter, a little less where the probe presses
     least_depth_mm: Annotated[float, Limits(0, 20), "no bone is looked for above this depth"] = 1.8
     most_depth_mm: Annotated[float, Limits(2, 60), "no bone is looked for below this depth"] = 16.0
-    # chosen on simulators by other hands, half of them not fitted to: a higher one costs points and makes few of them righter
+    # chosen on simulators by other hands that nothing was fitted to: a higher one costs points and makes few of them righter
     quality_gate: Annotated[float, Limits(0, 1), "frames below this quality are not points"] = 0.91
     beam_width_mm: Annotated[float, Limits(0, 10), "-6 dB width of the beam"] = 1.2
     tilt_sd_deg: Annotated[float, Limits(0, 20), "SD of the angle between beam and bone normal"] = 2.0
